@@ -1,0 +1,1 @@
+"""The mathematics: NumPy, OpenCV and Numba; no ROS, no clock, no logger."""

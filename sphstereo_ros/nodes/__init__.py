@@ -1,0 +1,1 @@
+"""One thin file a node: decode, one core call, publish."""

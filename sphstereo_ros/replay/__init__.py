@@ -1,0 +1,1 @@
+"""Bags, videos and folders of frames, in and out."""
