@@ -117,8 +117,8 @@ class Drop:
 class RangeImage:
     """Radial range on the current frame's equirectangular grid (H, 2H).
 
-    range : float32 metres (baselines, if not `is_metric`): NaN unknown, +Inf confidently beyond the
-        maximum, −Inf nearer than the minimum (REP-117)
+    range : float32 metres (baselines, if not `is_metric`): NaN unknown, +Inf confidently beyond
+        the maximum, −Inf nearer than the minimum (REP-117)
     sigma : float32, one standard deviation of it, same unit; NaN where range is not finite
     """
 

@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 from typing import Any, TypeVar, cast
 
 import numba
@@ -23,8 +24,9 @@ def kernel(function: F) -> F:
 
 
 def fast_kernel(function: F) -> F:
-    """Compile like `kernel`, allowing re-ordered arithmetic; not for code that meets NaN or Inf."""
-    return cast(F, numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=True)(function))
+    """Compile like `kernel`, with re-ordered arithmetic: not for code that meets NaN or Inf."""
+    jit = numba.njit(cache=True, nogil=True, error_model='numpy', fastmath=True)
+    return cast(F, jit(function))
 
 
 @cache
@@ -48,6 +50,6 @@ def rows_in_parallel(function: Callable[..., Any], rows: int, *args: Any) -> Non
         return
     edges = [rows * i // threads for i in range(threads + 1)]
     jobs = [_pool(threads).submit(function, a, b, *args)
-            for a, b in zip(edges[:-1], edges[1:], strict=True)]
+            for a, b in pairwise(edges)]
     for job in jobs:
         job.result()

@@ -1,0 +1,253 @@
+"""Every parameter of the package, stated once.
+
+Each group is a frozen dataclass whose fields carry name, default, unit, bounds and meaning. The
+core takes the groups as they are; ROS descriptors, the check of parameter files and the table in
+the documentation are all made from the same fields. `resolve` turns names and values, from
+wherever they come, into a checked `Config`, or raises `ParameterError`.
+"""
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+Value = bool | int | float | str | tuple[int, ...] | tuple[float, ...]
+
+
+class ParameterError(ValueError):
+    """A parameter was refused; the message says which and why."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """Name, type, default, bounds, unit and meaning of one parameter.
+
+    `runtime` says whether it may change while a node runs.
+    """
+
+    name: str
+    kind: type
+    default: Value
+    meaning: str
+    unit: str = ''
+    low: float = -math.inf
+    high: float = math.inf
+    choices: tuple[str, ...] = ()
+    runtime: bool = True
+    is_array: bool = False
+
+    def checked(self, value: object) -> Value:
+        """Return `value` in this parameter's type, or raise ParameterError with the reason."""
+        if self.is_array:
+            if not isinstance(value, Sequence) or isinstance(value, str) or not value:
+                raise ParameterError(f'{self.name}: needs a non-empty list, not {value!r}')
+            return tuple(self._scalar(v) for v in value)  # type: ignore[return-value]
+        return self._scalar(value)
+
+    def _scalar(self, value: object) -> bool | int | float | str:
+        if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        if type(value) is not self.kind:
+            raise ParameterError(f'{self.name}: needs {self.kind.__name__}, not {value!r}')
+        if isinstance(value, (int, float)) and not isinstance(value, bool):
+            if not self.low <= value <= self.high:  # NaN fails too
+                raise ParameterError(
+                    f'{self.name}: {value} is outside {self.low:g} … {self.high:g}')
+        elif self.choices and value not in self.choices:
+            raise ParameterError(f'{self.name}: {value!r} is none of {", ".join(self.choices)}')
+        return value  # type: ignore[return-value]
+
+
+def _p(name: str, default: Value, meaning: str, **more: Any) -> Any:
+    array = isinstance(default, tuple)
+    kind = type(default[0]) if isinstance(default, tuple) else type(default)
+    spec = Parameter(name, kind, default, meaning, is_array=array, **more)
+    return field(default=default, metadata={'parameter': spec})
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """The camera: model, mount on the vehicle, what of the vehicle it sees."""
+
+    model: str = _p('camera.model', 'equirectangular', 'projection of the input images',
+                    choices=('equirectangular',), runtime=False)
+    mask: str = _p('camera.mask', '', 'image file, non-zero = vehicle: unknown there',
+                   runtime=False)
+    mount_x: float = _p('camera.mount.x', 0.0, 'camera_link in base_link, forward', unit='m')
+    mount_y: float = _p('camera.mount.y', 0.0, 'camera_link in base_link, left', unit='m')
+    mount_z: float = _p('camera.mount.z', 0.0, 'camera_link in base_link, up', unit='m')
+    mount_roll: float = _p('camera.mount.roll', 0.0, 'R = Rz(yaw) Ry(pitch) Rx(roll)', unit='rad',
+                           low=-math.pi, high=math.pi)
+    mount_pitch: float = _p('camera.mount.pitch', 0.0, 'see camera.mount.roll', unit='rad',
+                            low=-math.pi, high=math.pi)
+    mount_yaw: float = _p('camera.mount.yaw', 0.0, 'see camera.mount.roll', unit='rad',
+                          low=-math.pi, high=math.pi)
+
+
+@dataclass(frozen=True)
+class BaselineConfig:
+    """Where metres come from."""
+
+    source: str = _p('baseline.source', 'fixed', 'what gives the distance between frames',
+                     choices=('fixed', 'speed', 'twist', 'odometry'))
+    length: float = _p('baseline.length', 0.0, 'fixed: distance between consecutive frames; '
+                       '0 = unknown, the output is relative', unit='m', low=0.0, high=1000.0)
+    speed: float = _p('baseline.speed', 0.0, 'speed: times the stamp difference; 0 = unknown',
+                      unit='m/s', low=0.0, high=1000.0)
+    minimum: float = _p('baseline.minimum', 0.02, 'a shorter measured baseline is a drop '
+                        '(hover)', unit='m', low=0.0, high=1000.0)
+    relative_sigma: float = _p('baseline.relative_sigma', 0.0, 'standard deviation of the '
+                               'baseline as a share of it, where its source tells none; 0 = left '
+                               'out of sigma', low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class PairingConfig:
+    """Which frames make a window."""
+
+    mode: str = _p('pairing.mode', 'monocular', 'one moving camera', choices=('monocular',),
+                   runtime=False)
+    intervals: tuple[int, ...] = _p('pairing.intervals', (1,), 'references, frames back', low=1,
+                                    high=100)
+    baselines: tuple[float, ...] = _p('pairing.baselines', (0.0,), 'references by distance '
+                                      'instead of pairing.intervals; 0 = unused', unit='m',
+                                      low=0.0, high=1000.0)
+    max_gap: float = _p('pairing.max_gap', 1.0, 'a longer gap between frames, or stamps that run '
+                        'backward, empty the buffer', unit='s', low=0.001, high=3600.0)
+
+
+@dataclass(frozen=True)
+class PoseConfig:
+    """Relative pose from bearings (stage 2)."""
+
+    working_height: int = _p('pose.working_height', 480, 'image height for tracking', low=60,
+                             high=4096)
+    max_points: int = _p('pose.max_points', 2500, 'correspondences used', low=50, high=100000)
+    inlier_threshold: float = _p('pose.inlier_threshold', 0.003, 'angular residual of an inlier',
+                                 unit='rad', low=1e-5, high=0.1)
+    min_inliers: int = _p('pose.min_inliers', 60, 'fewer are a drop', low=8)
+    min_inlier_ratio: float = _p('pose.min_inlier_ratio', 0.35, 'a smaller share is a drop',
+                                 low=0.0, high=1.0)
+    min_parallax: float = _p('pose.min_parallax', 0.0015, 'median parallax without rotation '
+                             'under which a pair is a hover or a pure rotation', unit='rad',
+                             low=0.0, high=1.0)
+    seed: int = _p('pose.seed', 1, 'of the random samples: the same input gives the same output')
+
+
+@dataclass(frozen=True)
+class AlignmentConfig:
+    """Motion direction and refinement on the aligned pair (stage 3)."""
+
+    method: str = _p('alignment.method', 'refined', 'refined: dense flow of the aligned pair; '
+                     "paper: the window-ratio estimator of the paper's section 3.1",
+                     choices=('refined', 'paper'))
+    working_height: int = _p('alignment.working_height', 480, 'polar height of the reduced '
+                             'aligned copy', low=60, high=4096)
+    iterations: int = _p('alignment.iterations', 2, 'dense refinements', low=0, high=10)
+    flow: str = _p('alignment.flow', 'medium', 'dense inverse search preset',
+                   choices=('ultrafast', 'fast', 'medium'))
+    rotation_sigma: float = _p('alignment.rotation_sigma', 0.005 * math.pi / 180,
+                               'least standard deviation of a refined rotation', unit='rad',
+                               low=0.0, high=0.1)
+    direction_sigma: float = _p('alignment.direction_sigma', 0.02 * math.pi / 180,
+                                'least standard deviation of a refined direction', unit='rad',
+                                low=0.0, high=0.1)
+
+
+@dataclass(frozen=True)
+class StereoConfig:
+    """Matching along the meridians (stage 4)."""
+
+    matcher: str = _p('stereo.matcher', 'flow', 'flow, flow_fast: dense flow with checks; '
+                      'bm, sgbm: as in OpenCV', choices=('flow', 'flow_fast', 'bm', 'sgbm'))
+    num_disparities: int = _p('stereo.num_disparities', 96, 'search range of bm and sgbm',
+                              unit='px', low=16, high=1024)
+    block_size: int = _p('stereo.block_size', 15, 'odd window of bm and sgbm', unit='px', low=3,
+                         high=51)
+    working_height: int = _p('stereo.working_height', 0, 'height of frames and depth; 0 = input',
+                             unit='px', low=0, high=8192, runtime=False)
+
+
+@dataclass(frozen=True)
+class RangeConfig:
+    """What of the range is published."""
+
+    minimum: float = _p('range.min', 0.3, 'nearer is −Inf', unit='m', low=0.0, high=1000.0)
+    maximum: float = _p('range.max', 120.0, 'confidently farther is +Inf', unit='m', low=0.1,
+                        high=10000.0)
+    max_relative_sigma: float = _p('range.max_relative_sigma', 0.3, 'sigma over range above which '
+                                   'the range is unknown', low=0.001, high=10.0)
+
+
+@dataclass(frozen=True)
+class PointsConfig:
+    """The point cloud."""
+
+    stride: int = _p('points.stride', 0, 'every n-th pixel and row; 0 = the least that keeps a '
+                     'cloud within 8 MB', unit='px', low=0, high=256)
+    colour: bool = _p('points.colour', False, 'rgb instead of intensity; frames carry colour',
+                      runtime=False)
+
+
+@dataclass(frozen=True)
+class Config:
+    """All groups."""
+
+    camera: CameraConfig = CameraConfig()
+    baseline: BaselineConfig = BaselineConfig()
+    pairing: PairingConfig = PairingConfig()
+    pose: PoseConfig = PoseConfig()
+    alignment: AlignmentConfig = AlignmentConfig()
+    stereo: StereoConfig = StereoConfig()
+    range: RangeConfig = RangeConfig()
+    points: PointsConfig = PointsConfig()
+
+
+def _specs() -> Iterator[tuple[str, str, Parameter]]:
+    for group in dataclasses.fields(Config):
+        for item in dataclasses.fields(group.default):  # type: ignore[arg-type]
+            yield group.name, item.name, item.metadata['parameter']
+
+
+PARAMETERS: dict[str, Parameter] = {spec.name: spec for _, _, spec in _specs()}
+
+
+def resolve(given: Mapping[str, object]) -> Config:
+    """Check `given` (names → values, all others at their default) and build the Config.
+
+    Raises
+    ------
+    ParameterError
+        for an unknown name, a wrong type, a value out of bounds, or values that exclude each other
+
+    """
+    for name in given:
+        if name not in PARAMETERS:
+            raise ParameterError(f'{name}: no node of this package has such a parameter')
+    values = {name: PARAMETERS[name].checked(value) for name, value in given.items()}
+    groups: dict[str, dict[str, Value]] = {}
+    for group, item, spec in _specs():
+        if spec.name in values:
+            groups.setdefault(group, {})[item] = values[spec.name]
+    default = Config()
+    config = dataclasses.replace(default, **{
+        group: dataclasses.replace(getattr(default, group), **items)
+        for group, items in groups.items()})
+    _check_together(config, values)
+    return config
+
+
+def _check_together(config: Config, given: Mapping[str, Value]) -> None:
+    baselines = config.pairing.baselines
+    if 0.0 in baselines and len(baselines) > 1:
+        raise ParameterError('pairing.baselines: 0 (unused) cannot stand beside other baselines')
+    if baselines != (0.0,) and 'pairing.intervals' in given:
+        raise ParameterError('pairing.intervals and pairing.baselines: give one of them, not both')
+    if config.stereo.num_disparities % 16:
+        raise ParameterError('stereo.num_disparities: must be a multiple of 16')
+    if config.stereo.block_size % 2 == 0:
+        raise ParameterError('stereo.block_size: must be odd')
+    if config.range.minimum >= config.range.maximum:
+        raise ParameterError('range.min: must be less than range.max')
