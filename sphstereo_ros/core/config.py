@@ -245,6 +245,10 @@ def _check_together(config: Config, given: Mapping[str, Value]) -> None:
         raise ParameterError('pairing.baselines: 0 (unused) cannot stand beside other baselines')
     if baselines != (0.0,) and 'pairing.intervals' in given:
         raise ParameterError('pairing.intervals and pairing.baselines: give one of them, not both')
+    if baselines != (0.0,) and ((config.baseline.source, config.baseline.length) == ('fixed', 0.0)
+                                or (config.baseline.source, config.baseline.speed)
+                                == ('speed', 0.0)):
+        raise ParameterError('pairing.baselines: baseline.source tells no metres')
     if config.stereo.num_disparities % 16:
         raise ParameterError('stereo.num_disparities: must be a multiple of 16')
     if config.stereo.block_size % 2 == 0:

@@ -1,0 +1,161 @@
+"""Stage 1: frames become windows of one current frame and its references, with prior poses."""
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+from sphstereo_ros.core.baseline import SECOND, MotionPriors
+from sphstereo_ros.core.config import Config
+from sphstereo_ros.core.frames import Drop, Frame, PairedWindow, Reference, RelativePose
+from sphstereo_ros.core.motion import ImuSample, OdometrySample, TwistSample
+
+MAX_WAITING = 10
+# How many frames back a wanted baseline is looked for.
+MAX_FRAMES = 100
+
+Outcome = PairedWindow | Drop
+
+
+class Pairer:
+    """Makes windows of the frames that come in.
+
+    Every frame has exactly one outcome: a window, or a Drop that says why there is none. A frame
+    whose odometry (or twist) is not there yet waits for it, and its outcome comes with a later
+    message. Drops of sensor messages come on top; their causes begin with the sensor's name.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._priors = MotionPriors(config)
+        self._waiting: deque[Frame] = deque()
+        self._frames: deque[Frame] = deque()
+        self._last: Frame | None = None
+        self.configure(config)
+
+    def configure(self, config: Config) -> None:
+        """Take new parameters; frames and sensor samples stay."""
+        self._config = config.pairing
+        self._priors.configure(config)
+        by_distance = config.pairing.baselines != (0.0,)
+        self._wanted = config.pairing.baselines if by_distance else ()
+        size = MAX_FRAMES if by_distance else max(config.pairing.intervals)
+        self._frames = deque(self._frames, maxlen=size)
+
+    def add_frame(self, frame: Frame) -> list[Outcome]:
+        """Take the next frame of the camera."""
+        drop = self._discontinuity(frame)
+        if drop is not None and drop.cause == 'duplicate_stamp':
+            return [drop]
+        out: list[Outcome] = []
+        if drop is not None:
+            out = self.flush()
+            self._frames.clear()
+            self._priors.time_jumped(frame.key.stamp)
+            out.append(drop)
+            self._frames.append(frame)
+        else:
+            self._waiting.append(frame)
+            out = self._release()
+        self._last = frame
+        return out
+
+    def add_odometry(self, sample: OdometrySample) -> list[Outcome]:
+        """Take a sample of odometry; gives the frames that waited for it."""
+        return self._after(self._priors.add_odometry(sample))
+
+    def add_twist(self, sample: TwistSample) -> list[Outcome]:
+        """Take a sample of velocity; gives the frames that waited for it."""
+        return self._after(self._priors.add_twist(sample))
+
+    def add_imu(self, sample: ImuSample) -> list[Outcome]:
+        """Take a sample of an IMU."""
+        return self._after(self._priors.add_imu(sample))
+
+    def flush(self) -> list[Outcome]:
+        """Nothing more is to come for now: what still waits is dropped."""
+        out: list[Outcome] = []
+        while self._waiting:
+            frame = self._waiting.popleft()
+            sensor = self._priors.waits_for(frame.key.stamp)
+            out.append(Drop(f'{sensor}_missing', 'none came while the frame waited') if sensor
+                       else self._window(frame))
+            self._frames.append(frame)
+        return out
+
+    def _after(self, drop: Drop | None) -> list[Outcome]:
+        return [*([] if drop is None else [drop]), *self._release()]
+
+    def _release(self) -> list[Outcome]:
+        out: list[Outcome] = []
+        while self._waiting and (len(self._waiting) > MAX_WAITING
+                                 or not self._priors.waits_for(self._waiting[0].key.stamp)):
+            frame = self._waiting.popleft()
+            out.append(self._window(frame))
+            self._frames.append(frame)
+        return out
+
+    def _discontinuity(self, frame: Frame) -> Drop | None:
+        """Why `frame` does not continue what came before it, if it does not."""
+        last = self._last
+        if last is None:
+            return Drop('first_frame')
+        if frame.key.frame_id != last.key.frame_id:
+            return Drop('frame_id_changed', f'{last.key.frame_id!r} to {frame.key.frame_id!r}')
+        if frame.key.stamp == last.key.stamp:
+            return Drop('duplicate_stamp', f'{frame.key.stamp} ns')
+        seconds = (frame.key.stamp - last.key.stamp) / SECOND
+        if seconds < 0:
+            return Drop('stamp_backward', f'by {-seconds:.3f} s')
+        if seconds > self._config.max_gap:
+            return Drop('stamp_gap', f'{seconds:.3f} s')
+        if frame.image.shape != last.image.shape:
+            return Drop('size_changed', f'{last.image.shape} to {frame.image.shape}')
+        return None
+
+    def _window(self, frame: Frame) -> Outcome:
+        """Pair `frame` with earlier ones, nearest first."""
+        found = self._by_distance(frame) if self._wanted else self._by_interval(frame)
+        drops = [pose for _, pose in found if isinstance(pose, Drop)]
+        references = [Reference(reference, pose) for reference, pose in found
+                      if isinstance(pose, RelativePose)]
+        if references:
+            references.sort(key=lambda r: (r.pose.baseline, -r.frame.key.stamp))
+            return PairedWindow(frame, tuple(references))
+        return drops[0] if drops else Drop('no_reference', 'no earlier frame is far enough back')
+
+    def _by_interval(self, frame: Frame) -> list[tuple[Frame, RelativePose | Drop]]:
+        return [self._prior(frame, back) for back in sorted(set(self._config.intervals))
+                if back <= len(self._frames)]
+
+    def _prior(self, frame: Frame, back: int) -> tuple[Frame, RelativePose | Drop]:
+        reference = self._frames[-back]
+        return reference, self._priors.between(reference.key.stamp, frame.key.stamp, back)
+
+    def _by_distance(self, frame: Frame) -> list[tuple[Frame, RelativePose | Drop]]:
+        """The earlier frames whose distances are nearest to the wanted ones."""
+        found: list[tuple[Frame, RelativePose]] = []
+        drops: list[tuple[Frame, RelativePose | Drop]] = []
+        for back in range(1, len(self._frames) + 1):
+            reference, pose = self._prior(frame, back)
+            if isinstance(pose, Drop):
+                drops.append((reference, pose))
+                continue
+            found.append((reference, pose))
+            if pose.baseline > 2 * max(self._wanted):
+                break
+        chosen = nearest_matches([pose.baseline for _, pose in found], self._wanted)
+        return [found[i] for i in chosen] or ([] if found else drops)
+
+
+def nearest_matches(distances: list[float], wanted: Iterable[float]) -> list[int]:
+    """Indices into `distances` of the nearest match to each wanted distance, without repeats.
+
+    A wanted distance that `distances` have not reached is left out, unless the farthest one comes
+    within half of the mean step between them: a nearer match will not come.
+    """
+    if not distances:
+        return []
+    reach = max(distances)
+    half_step = reach / len(distances) / 2
+    chosen = {min(range(len(distances)), key=lambda i: abs(distances[i] - distance))
+              for distance in wanted if distance <= reach + half_step}
+    return sorted(chosen)

@@ -1,0 +1,267 @@
+"""Windows of frames: which references, which drops, what waits."""
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sphstereo_ros.core.config import ParameterError, resolve
+from sphstereo_ros.core.frames import Drop, Frame, FrameKey, PairedWindow
+from sphstereo_ros.core.motion import ImuSample, OdometrySample, TwistSample
+from sphstereo_ros.core.pairing import MAX_FRAMES, MAX_WAITING, Outcome, Pairer, nearest_matches
+
+STEP = 33_333_333
+
+
+def frame(stamp: int, frame_id: str = 'camera_optical', height: int = 4) -> Frame:
+    return Frame(FrameKey(stamp, frame_id), np.zeros((height, 2 * height), np.uint8))
+
+
+def odometry(stamp: int, x: float) -> OdometrySample:
+    return OdometrySample(stamp, np.array([x, 0.0, 0.0]), np.eye(3))
+
+
+def pairer(**given: object) -> Pairer:
+    return Pairer(resolve({k.replace('__', '.'): v for k, v in given.items()}))
+
+
+def window(outcome: list[Outcome]) -> tuple[int, list[tuple[int, float]]]:
+    """The one window among the outcome: current stamp, and (stamp, baseline) of references."""
+    assert len(outcome) == 1, outcome
+    assert isinstance(outcome[0], PairedWindow), outcome
+    return outcome[0].current.key.stamp, [(r.frame.key.stamp, round(r.pose.baseline, 9))
+                                          for r in outcome[0].references]
+
+
+def cause(outcome: list[Outcome]) -> str:
+    assert len(outcome) == 1, outcome
+    assert isinstance(outcome[0], Drop), outcome
+    return outcome[0].cause
+
+
+def test_intervals_fill_as_frames_come() -> None:
+    p = pairer(pairing__intervals=(3, 1), baseline__length=0.28)
+    assert cause(p.add_frame(frame(0))) == 'first_frame'
+    assert window(p.add_frame(frame(1))) == (1, [(0, 0.28)])
+    assert window(p.add_frame(frame(2))) == (2, [(1, 0.28)])
+    assert window(p.add_frame(frame(3))) == (3, [(2, 0.28), (0, 0.84)])
+    assert window(p.add_frame(frame(4))) == (4, [(3, 0.28), (1, 0.84)])
+
+
+def test_a_reference_not_there_yet_is_not_waited_for() -> None:
+    p = pairer(pairing__intervals=(2,), baseline__length=0.28)
+    assert cause(p.add_frame(frame(0))) == 'first_frame'
+    assert cause(p.add_frame(frame(1))) == 'no_reference'
+    assert window(p.add_frame(frame(2))) == (2, [(0, 0.56)])
+
+
+@pytest.mark.parametrize(('second', 'expected'), [
+    (frame(STEP, 'other'), 'frame_id_changed'),
+    (frame(STEP, height=8), 'size_changed'),
+    (frame(-STEP), 'stamp_backward'),
+    (frame(1_000_000_001), 'stamp_gap'),
+])
+def test_a_discontinuity_starts_anew(second: Frame, expected: str) -> None:
+    p = pairer(baseline__length=0.28)
+    p.add_frame(frame(0))
+    assert cause(p.add_frame(second)) == expected
+    stamp = second.key.stamp
+    third = frame(stamp + STEP, second.key.frame_id, second.image.shape[0])
+    assert window(p.add_frame(third)) == (stamp + STEP, [(stamp, 0.28)])
+
+
+def test_a_duplicate_changes_nothing() -> None:
+    p = pairer(baseline__length=0.28)
+    p.add_frame(frame(0))
+    p.add_frame(frame(STEP))
+    assert cause(p.add_frame(frame(STEP))) == 'duplicate_stamp'
+    assert window(p.add_frame(frame(2 * STEP))) == (2 * STEP, [(STEP, 0.28)])
+
+
+def test_a_gap_of_exactly_the_limit_is_none() -> None:
+    p = pairer()
+    p.add_frame(frame(0))
+    assert isinstance(p.add_frame(frame(1_000_000_000))[0], PairedWindow)
+
+
+def test_a_frame_waits_for_odometry_that_encloses_it() -> None:
+    p = pairer(baseline__source='odometry')
+    assert p.add_odometry(odometry(0, 0.0)) == []
+    assert cause(p.add_frame(frame(0))) == 'first_frame'
+    assert p.add_frame(frame(100)) == []
+    assert p.add_frame(frame(200)) == []
+    assert window(p.add_odometry(odometry(150, 1.5))) == (100, [(0, 1.0)])
+    assert window(p.add_odometry(odometry(250, 2.5))) == (200, [(100, 1.0)])
+
+
+def test_an_equal_stamp_needs_no_later_message() -> None:
+    p = pairer(baseline__source='odometry')
+    p.add_frame(frame(0))
+    p.add_odometry(odometry(0, 0.0))
+    p.add_odometry(odometry(100, 1.0))
+    assert window(p.add_frame(frame(100))) == (100, [(0, 1.0)])
+
+
+def test_a_frame_waits_for_twist() -> None:
+    p = pairer(baseline__source='twist')
+    p.add_frame(frame(0))
+    p.add_twist(TwistSample(0, np.array([2.0, 0, 0]), np.zeros(3)))
+    assert p.add_frame(frame(500_000_000)) == []
+    out = p.add_twist(TwistSample(500_000_000, np.array([2.0, 0, 0]), np.zeros(3)))
+    assert window(out) == (500_000_000, [(0, 1.0)])
+
+
+def test_frames_do_not_wait_for_ever() -> None:
+    p = pairer(baseline__source='odometry')
+    p.add_frame(frame(0))
+    for i in range(1, MAX_WAITING + 1):
+        assert p.add_frame(frame(i)) == []
+    assert cause(p.add_frame(frame(MAX_WAITING + 1))) == 'odometry_missing'
+    assert [d.cause for d in p.flush() if isinstance(d, Drop)] == ['odometry_missing'] * 10
+    assert p.flush() == []
+
+
+def test_what_waits_is_dropped_before_a_new_start() -> None:
+    p = pairer(baseline__source='odometry')
+    p.add_frame(frame(0))
+    p.add_frame(frame(1))
+    out = p.add_frame(frame(2, 'other'))
+    assert [d.cause for d in out if isinstance(d, Drop)] == ['odometry_missing',
+                                                             'frame_id_changed']
+
+
+def test_a_recording_that_loops() -> None:
+    """Stamps run backward by seconds, in odometry as in frames, and the second round is whole."""
+    p = pairer(baseline__source='odometry')
+    outcomes: list[Outcome] = []
+    for _ in range(2):
+        for i in range(100):
+            outcomes += p.add_frame(frame(i * STEP)) + p.add_odometry(odometry(i * STEP, 0.3 * i))
+    causes = Counter(o.cause for o in outcomes if isinstance(o, Drop))
+    assert causes == {'first_frame': 1, 'stamp_backward': 1}
+    assert sum(isinstance(o, PairedWindow) for o in outcomes) == 198
+
+
+def test_sensor_drops_come_on_top() -> None:
+    p = pairer()
+    p.add_imu(ImuSample(0, np.zeros(3)))
+    assert cause(p.add_imu(ImuSample(0, np.zeros(3)))) == 'imu_duplicate'
+    assert cause(p.add_odometry(odometry(0, np.nan))) == 'odometry_invalid'
+
+
+def test_baselines_take_the_nearest_match() -> None:
+    p = pairer(pairing__baselines=(1.0, 0.3), baseline__length=0.28)
+    assert cause(p.add_frame(frame(0))) == 'first_frame'
+    assert window(p.add_frame(frame(1))) == (1, [(0, 0.28)])
+    assert window(p.add_frame(frame(2))) == (2, [(1, 0.28)])
+    # 0.84 is not taken for 1.0: 1.12 comes nearer.
+    assert window(p.add_frame(frame(3))) == (3, [(2, 0.28)])
+    assert window(p.add_frame(frame(4))) == (4, [(3, 0.28), (0, 1.12)])
+    assert window(p.add_frame(frame(5))) == (5, [(4, 0.28), (1, 1.12)])
+
+
+def test_hover_among_baselines() -> None:
+    """Frames of a hover are no references; what lies before it still is."""
+    p = pairer(pairing__baselines=(1.0,), baseline__source='odometry')
+    outcomes = []
+    for i, x in enumerate([0.0, 0.5, 1.0, 1.001, 1.002]):
+        p.add_odometry(odometry(i, x))
+        outcomes.append(p.add_frame(frame(i)))
+    assert window(outcomes[4]) == (4, [(0, 1.002)])
+    p = pairer(pairing__baselines=(1.0,), baseline__source='odometry')
+    for i in range(2):
+        p.add_odometry(odometry(i, 0.0))
+        last = p.add_frame(frame(i))
+    assert cause(last) == 'baseline_too_short'
+
+
+def test_hover_among_intervals() -> None:
+    p = pairer(pairing__intervals=(1, 3), baseline__source='odometry')
+    for i, x in enumerate([0.0, 0.5, 1.0, 1.001]):
+        p.add_odometry(odometry(i, x))
+        last = p.add_frame(frame(i))
+    assert window(last) == (3, [(0, 1.001)])
+
+
+def test_a_baseline_out_of_reach_is_named() -> None:
+    p = pairer(pairing__baselines=(2.8,), baseline__length=0.28)
+    p.add_frame(frame(0))
+    assert cause(p.add_frame(frame(1))) == 'no_reference'
+
+
+@pytest.mark.parametrize('given', [{'baseline.source': 'fixed'}, {'baseline.source': 'speed'}])
+def test_baselines_need_metres(given: dict[str, object]) -> None:
+    with pytest.raises(ParameterError, match=r'pairing\.baselines'):
+        resolve({'pairing.baselines': (1.0,), **given})
+
+
+def test_frames_kept_are_bounded() -> None:
+    p = pairer(pairing__baselines=(500.0,), baseline__length=1.0)
+    for i in range(MAX_FRAMES + 50):
+        p.add_frame(frame(i))
+    assert len(p._frames) == MAX_FRAMES
+    p.configure(resolve({'pairing.intervals': (2,)}))
+    assert len(p._frames) == 2
+    assert window(p.add_frame(frame(999))) == (999, [(MAX_FRAMES + 48, 1e-6)])
+
+
+def test_the_pose_follows_parameters_at_run_time() -> None:
+    p = pairer(baseline__length=0.28)
+    p.add_frame(frame(0))
+    p.configure(resolve({'baseline.length': 0.5}))
+    assert window(p.add_frame(frame(1))) == (1, [(0, 0.5)])
+
+
+@given(st.lists(st.floats(0.0, 10.0), max_size=12), st.lists(st.floats(0.01, 10.0), min_size=1,
+                                                            max_size=3))
+def test_nearest_match_is_the_nearest(distances: list[float], wanted: list[float]) -> None:
+    chosen = nearest_matches(distances, wanted)
+    assert len(set(chosen)) == len(chosen) <= len(wanted)
+    for want in wanted:
+        if distances and want <= max(distances):
+            best = min(abs(d - want) for d in distances)
+            assert any(abs(distances[i] - want) == best for i in chosen)
+
+
+EVENTS = st.one_of(
+    st.tuples(st.just('frame'), st.integers(0, 60), st.sampled_from(['a', 'b'])),
+    st.tuples(st.sampled_from(['odometry', 'twist', 'imu', 'flush']), st.integers(0, 60),
+              st.just('')))
+
+
+@given(st.lists(EVENTS, max_size=60), st.sampled_from(['fixed', 'twist', 'odometry']),
+       st.sampled_from([(1,), (1, 3), (2,)]))
+def test_every_frame_has_one_outcome(events: list[tuple[str, int, str]], source: str,
+                                     intervals: tuple[int, ...]) -> None:
+    """Whatever comes in whatever order: no frame is lost, none is told of twice."""
+    p = pairer(baseline__source=source, pairing__intervals=intervals, pairing__max_gap=1.0)
+    out: list[Outcome] = []
+    frames = 0
+    for kind, tick, name in events:
+        stamp = tick * 50_000_000
+        if kind == 'frame':
+            frames += 1
+            out += p.add_frame(frame(stamp, name))
+        elif kind == 'odometry':
+            out += p.add_odometry(odometry(stamp, 0.1 * tick))
+        elif kind == 'twist':
+            out += p.add_twist(TwistSample(stamp, np.array([2.0, 0, 0]), np.zeros(3)))
+        elif kind == 'imu':
+            out += p.add_imu(ImuSample(stamp, np.zeros(3)))
+        else:
+            out += p.flush()
+    out += p.flush()
+    of_sensors = ('odometry_duplicate', 'odometry_backward', 'twist_duplicate', 'twist_backward',
+                  'imu_duplicate', 'imu_backward')
+    told = [o for o in out if not (isinstance(o, Drop) and o.cause in of_sensors)]
+    assert len(told) == frames
+    for o in told:
+        if isinstance(o, PairedWindow):
+            stamps = [r.frame.key.stamp for r in o.references]
+            assert 1 <= len(set(stamps)) == len(stamps) <= len(intervals)
+            assert all(s < o.current.key.stamp for s in stamps)
+            assert {r.frame.key.frame_id for r in o.references} == {o.current.key.frame_id}
+            assert o.is_metric == (source != 'fixed')
