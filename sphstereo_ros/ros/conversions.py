@@ -53,6 +53,7 @@ FloatArray = NDArray[np.float64]
 Window = TypeVar('Window', bound=FrameWindow)
 
 UNIT_TOLERANCE = 1e-3
+GREATEST_POSITION = 1e9
 FLOAT32 = 7  # sensor_msgs/PointField
 
 
@@ -73,7 +74,7 @@ def _read_vector(msg: Any) -> FloatArray:
 
 def _read_rotation(msg: Any) -> FloatArray | Drop:
     quaternion = np.array([msg.x, msg.y, msg.z, msg.w], np.float64)
-    norm = float(np.linalg.norm(quaternion))
+    norm = math.hypot(*quaternion)
     if not math.isfinite(norm):
         return Drop('not_finite', f'orientation {quaternion}')
     if abs(norm - 1) > UNIT_TOLERANCE:
@@ -84,7 +85,7 @@ def _read_rotation(msg: Any) -> FloatArray | Drop:
 def _read_pose(pose: Any) -> tuple[FloatArray, FloatArray] | Drop:
     """geometry_msgs/Pose → position, rotation."""
     position = _read_vector(pose.position)
-    if not np.isfinite(position).all():
+    if not np.abs(position).max() < GREATEST_POSITION:  # nor is NaN
         return Drop('not_finite', f'position {position}')
     rotation = _read_rotation(pose.orientation)
     return rotation if isinstance(rotation, Drop) else (position, rotation)

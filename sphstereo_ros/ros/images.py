@@ -6,6 +6,7 @@ undecodable_image.
 """
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -205,12 +206,29 @@ def compressed_size(data: bytes) -> CompressedSize | Drop:
         return Drop('empty_image', 'no data')
     if data.startswith(b'\xff\xd8'):
         return _jpeg_size(data)
-    if data.startswith(b'\x89PNG\r\n\x1a\n'):
-        if len(data) < 33 or data[12:16] != b'IHDR' or data.rfind(b'IEND') < 33:
-            return Drop('undecodable_image', 'PNG is cut off')
-        return CompressedSize('png', int.from_bytes(data[20:24], 'big'),
-                              int.from_bytes(data[16:20], 'big'))
+    if data.startswith(_PNG):
+        return _png_size(data)
     return Drop('unknown_encoding', 'neither JPEG nor PNG')
+
+
+_PNG = b'\x89PNG\r\n\x1a\n'
+
+
+def _png_size(data: bytes) -> CompressedSize | Drop:
+    """Walk the chunks: a wrong length makes OpenCV ask for gigabytes."""
+    at, size = len(_PNG), None
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at:at + 4], 'big')
+        kind = data[at + 4:at + 8]
+        if zlib.crc32(data[at + 4:end]) != int.from_bytes(data[end:end + 4], 'big'):
+            return Drop('undecodable_image', 'PNG is damaged or cut off')
+        if kind == b'IHDR':
+            size = CompressedSize('png', int.from_bytes(data[at + 12:at + 16], 'big'),
+                                  int.from_bytes(data[at + 8:at + 12], 'big'))
+        if kind == b'IEND' and size is not None:
+            return size
+        at = end + 4
+    return Drop('undecodable_image', 'PNG is cut off')
 
 
 _FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
