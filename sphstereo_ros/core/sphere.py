@@ -1,9 +1,9 @@
 """The exact geometry of a pair on the sphere.
 
-A reference view C1 and a current view C2 = C1 + b·t. θ1 and θ2 are the angles between t and the ray
-to the same point from C1 and C2; the parallax is δ = θ2 − θ1 ≥ 0. The law of sines gives
-r1 = b·sin θ2 / sin δ and r2 = b·sin θ1 / sin δ. (The paper's equation 2 divides by cos φ where its
-own appendix says to multiply; see doc/geometry in the README.)
+A reference view C1 and a current view C2 = C1 + b·t. θ1 and θ2 are the angles between t and the
+ray to the same point from C1 and C2; the parallax is δ = θ2 − θ1 ≥ 0. The law of sines gives
+r1 = b·sin θ2 / sin δ and r2 = b·sin θ1 / sin δ. (The paper's equation 2 divides by cos φ where
+its own appendix says to multiply: that error points toward "farther than it is".)
 """
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def polar_bearings(theta: ArrayLike, azimuth: ArrayLike, axes: Floats) -> Floats
                                          np.asarray(azimuth, np.float64))
     polar = np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth),
                       np.cos(theta)], axis=-1)
-    return polar @ axes.T
+    return np.asarray(polar @ axes.T)
 
 
 def range_from_parallax(theta2: ArrayLike, parallax: ArrayLike, baseline: float) -> Floats:
@@ -57,7 +57,7 @@ def range_from_parallax(theta2: ArrayLike, parallax: ArrayLike, baseline: float)
     possible = (delta >= 0) & (delta < theta2) & (theta2 <= np.pi)
     with np.errstate(divide='ignore', invalid='ignore'):
         r = baseline * np.sin(theta2 - delta) / np.sin(delta)
-    return np.where(possible, r, np.nan)
+    return np.asarray(np.where(possible, r, np.nan))
 
 
 def parallax_from_range(theta2: ArrayLike, range2: ArrayLike, baseline: float) -> Floats:
@@ -67,7 +67,7 @@ def parallax_from_range(theta2: ArrayLike, range2: ArrayLike, baseline: float) -
     """
     theta2, r2 = np.broadcast_arrays(np.asarray(theta2, np.float64),
                                      np.asarray(range2, np.float64))
-    return np.arctan2(baseline * np.sin(theta2), r2 + baseline * np.cos(theta2))
+    return np.asarray(np.arctan2(baseline * np.sin(theta2), r2 + baseline * np.cos(theta2)))
 
 
 def range_sigma(theta2: ArrayLike, parallax: ArrayLike, baseline: float, *,
@@ -78,7 +78,7 @@ def range_sigma(theta2: ArrayLike, parallax: ArrayLike, baseline: float, *,
     with np.errstate(divide='ignore', invalid='ignore'):
         from_parallax = np.asarray(parallax_sigma) * baseline * np.sin(theta2) / np.sin(delta)**2
         from_baseline = np.sin(theta2 - delta) / np.sin(delta) * baseline_sigma
-    return np.hypot(from_parallax, from_baseline)
+    return np.asarray(np.hypot(from_parallax, from_baseline))
 
 
 def paper_range(latitude: ArrayLike, pixels: ArrayLike, polar_height: int,

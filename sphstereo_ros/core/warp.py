@@ -14,7 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .frames import Image8, RelativePose
 from .jit import fast_kernel, rows_in_parallel
+from .sphere import polar_axes
 
 Floats = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -47,11 +49,11 @@ class PolarGrid:
 
     def theta(self) -> Floats:
         """Polar angle of every column, rad; outside 0 … π in the margins."""
-        return (np.arange(self.shape[1]) - self.margin + 0.5) * self.pixel
+        return np.asarray((np.arange(self.shape[1]) - self.margin + 0.5) * self.pixel, np.float64)
 
     def azimuth(self) -> Floats:
         """Azimuth of every row, rad."""
-        return (np.arange(self.shape[0]) - self.wrap + 0.5) * self.pixel
+        return np.asarray((np.arange(self.shape[0]) - self.wrap + 0.5) * self.pixel, np.float64)
 
 
 def with_border(image: NDArray[Any]) -> NDArray[Any]:
@@ -65,7 +67,7 @@ def with_border(image: NDArray[Any]) -> NDArray[Any]:
     columns = np.pad(half, BORDER, mode='wrap')
     out[:BORDER] = image[BORDER - 1::-1][:, columns]
     out[-BORDER:] = image[:-BORDER - 1:-1][:, columns]
-    return out
+    return np.asarray(out)
 
 
 @fast_kernel
@@ -156,4 +158,14 @@ def rotation_map(rotation: Floats, shape: tuple[int, int]) -> tuple[Map, Map]:
 def resample(bordered: NDArray[Any], maps: tuple[Map, Map],
              interpolation: int = cv2.INTER_LINEAR) -> NDArray[Any]:
     """`cv2.remap` of an image `with_border`; maps from this module never leave it."""
-    return cv2.remap(bordered, maps[0], maps[1], interpolation, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.remap(bordered, maps[0], maps[1], interpolation,
+                                borderMode=cv2.BORDER_REPLICATE))
+
+
+def aligned_pair(reference: Image8, current: Image8, pose: RelativePose,
+                 grid: PolarGrid) -> tuple[Image8, Image8, Floats]:
+    """Both views on the polar grid: (reference, current, axes of the current view)."""
+    axes = polar_axes(pose.direction)
+    return (resample(with_border(reference),
+                     polar_map(grid, pose.rotation.T @ axes, reference.shape)),
+            resample(with_border(current), polar_map(grid, axes, current.shape)), axes)

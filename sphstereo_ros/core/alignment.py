@@ -1,0 +1,102 @@
+"""Stage 3, motion alignment: refine each pose on a reduced aligned copy of the pair.
+
+In the aligned pair every still point moves along its own meridian. What is left of motion across
+the meridians is the error of rotation and direction, and it is solved for over the whole sphere.
+"""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import AlignmentConfig, Config
+from .frames import AlignedWindow, Drop, Frame, Image8, Reference, RelativePose, StabilisedWindow
+from .paper import window_ratio_direction
+from .relative_pose import Correspondences, PoseEstimate, refine
+from .sphere import polar_bearings
+from .stabilisation import reduced, with_length
+from .tracking import features, follow, spacing_for
+from .warp import PolarGrid, aligned_pair
+
+Floats = NDArray[np.float64]
+
+_MARGIN, _WRAP = 16, 16
+_POLE = 0.1  # rad round both poles, where the grid is too stretched to track
+
+
+def aligned_correspondences(reference: Image8, current: Image8, pose: RelativePose,
+                            grid: PolarGrid, count: int) -> Correspondences:
+    """Features followed between the views on the polar grid, back as bearings of each view."""
+    ref, cur, axes = aligned_pair(reference, current, pose, grid)
+    inside = np.zeros(grid.shape, bool)
+    inside[grid.wrap:-grid.wrap, np.sin(grid.theta()) > np.sin(_POLE)] = True
+    points = features(cur, spacing_for(count, grid.height), inside)
+    moved, found = follow(cur, ref, points)
+    offset = np.array([grid.margin, grid.wrap]) - 0.5
+
+    def bearings(pixels: NDArray[np.float32]) -> Floats:
+        theta, azimuth = ((pixels[found] - offset) * grid.pixel).T
+        return polar_bearings(theta, azimuth, axes)
+
+    return Correspondences(bearings(moved) @ pose.rotation, bearings(points))
+
+
+class Aligner:
+    """Refines rotation and direction of every reference."""
+
+    def __init__(self, config: Config, mask: Image8 | None = None) -> None:
+        self.config: AlignmentConfig = config.alignment
+        self._mask = mask
+
+    def warm_up(self) -> None:
+        """Compile what `process` needs."""
+        noise = np.random.default_rng(0).integers(0, 255, (64, 128), np.uint8)
+        pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -1.0]))
+        aligned_correspondences(noise, noise, pose, PolarGrid(64, _MARGIN, _WRAP), 500)
+
+    def process(self, window: StabilisedWindow) -> AlignedWindow | Drop:
+        """Refine every reference's pose; those that fail are left out.
+
+        If none is left, the nearest one's failure is returned: `alignment_failed`.
+        """
+        done = [self._reference(window.current, r) for r in window.references]
+        good = tuple(r for r in done if isinstance(r, Reference))
+        if good:
+            return AlignedWindow(window.current, good)
+        return next(d for d in done if isinstance(d, Drop))
+
+    def _reference(self, current: Frame, reference: Reference) -> Reference | Drop:
+        height = min(self.config.working_height, current.image.shape[0])
+        images = [reduced(f.image, height) for f in (reference.frame, current)]
+        if self.config.method == 'paper':
+            pose = window_ratio_direction(images[0], images[1], reference.pose)
+            return replace(reference, pose=pose) if isinstance(pose, RelativePose) else pose
+        pose = reference.pose
+        for _ in range(self.config.iterations):
+            refined = self._refined(images[0], images[1], pose)
+            if isinstance(refined, Drop):
+                return refined
+            pose = with_length(refined, reference.pose)
+        return replace(reference, pose=self._with_floor(pose))
+
+    def _refined(self, reference: Image8, current: Image8,
+                 pose: RelativePose) -> PoseEstimate | Drop:
+        grid = PolarGrid(current.shape[0], _MARGIN, _WRAP)
+        points = aligned_correspondences(reference, current, pose, grid, self.config.max_points)
+        if len(points) < 100:
+            return Drop('alignment_failed', f'{len(points)} points with texture')
+        refined = refine(pose.rotation, -pose.direction, points, iterations=15)
+        if refined is None or refined.inliers.sum() < 0.3 * len(points):
+            return Drop('alignment_failed', 'the aligned pair does not fit one motion')
+        return refined
+
+    def _with_floor(self, pose: RelativePose) -> RelativePose:
+        """Add to the covariance the systematic part, which residuals do not show."""
+        if pose.covariance is None:
+            return pose
+        across = np.eye(3) - np.outer(pose.direction, pose.direction)
+        floor = np.zeros((6, 6))
+        floor[:3, :3] = self.config.rotation_sigma**2 * np.eye(3)
+        floor[3:, 3:] = (pose.baseline * self.config.direction_sigma)**2 * across
+        return replace(pose, covariance=pose.covariance + floor)

@@ -1,0 +1,49 @@
+"""Point clouds in `base_link` from range images."""
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera import Equirectangular
+from .config import CameraConfig, Config
+from .frames import Frame, PointCloud, RangeImage
+from .rotations import mount
+
+MAX_BYTES = 8_000_000
+BYTES_PER_POINT = 20  # x, y, z, colour or intensity, sigma
+
+
+def default_stride(height: int) -> int:
+    """Least stride that keeps a cloud of a (height, 2·height) range image within MAX_BYTES."""
+    stride = 1
+    while -(-height // stride) * -(-2 * height // stride) * BYTES_PER_POINT > MAX_BYTES:
+        stride += 1
+    return stride
+
+
+@lru_cache(maxsize=4)
+def _bearings(height: int, stride: int, camera: CameraConfig) -> NDArray[np.float32]:
+    """Bearings of every stride-th pixel in base_link, (rows, columns, 3)."""
+    v, u = np.mgrid[0:height:stride, 0:2 * height:stride]
+    optical = Equirectangular(height, 2 * height).unproject(np.stack([u, v], -1).astype(float))
+    return (optical @ mount(camera).rotation.T).astype(np.float32)
+
+
+def point_cloud(range_image: RangeImage, frame: Frame, config: Config) -> PointCloud:
+    """Points of the finite ranges, every `points.stride`-th pixel, in `base_link`.
+
+    frame : the current frame, for intensity or colour
+    """
+    height = range_image.range.shape[0]
+    stride = config.points.stride or default_stride(height)
+    r = range_image.range[::stride, ::stride]
+    known = np.isfinite(r)
+    bearings = _bearings(height, stride, config.camera)
+    xyz = bearings[known] * r[known][:, None] + mount(config.camera).position.astype(np.float32)
+    sigma = range_image.sigma[::stride, ::stride][known]
+    if config.points.colour and frame.colour is not None:
+        bgr = frame.colour[::stride, ::stride][known]
+        return PointCloud(range_image.key, xyz, sigma, bgr=bgr)
+    return PointCloud(range_image.key, xyz, sigma, frame.image[::stride, ::stride][known])

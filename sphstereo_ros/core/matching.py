@@ -1,0 +1,140 @@
+"""Matching along the meridians of an aligned pair.
+
+A matcher takes both views on one polar grid (rows are meridians) and gives the parallax of the
+current view in pixels along θ, δ = θ_current − θ_reference, with its standard deviation. What it
+does not know is NaN.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import StereoConfig
+from .frames import Image8
+
+Pixels = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Parallax:
+    """Parallax on a polar grid: `pixels` and `sigma`, float32 of the grid's shape; NaN unknown.
+
+    A matcher whose search ends at zero cannot say that a point is beyond all range: `signed` tells
+    that parallaxes about zero were searched on both sides.
+    """
+
+    pixels: Pixels
+    sigma: Pixels
+    signed: bool
+
+
+Matcher = Callable[[Image8, Image8], Parallax]
+
+# Constants of the error model, fitted to the tuning scenes: a floor, the grey-level noise that
+# gradients are weighed against, and the weight of the forward–backward difference.
+_FLOOR = 0.04
+_NOISE = 1.2
+_FORTH_AND_BACK = 0.5
+
+
+def structure(image: Image8, window: int = 9) -> Pixels:
+    """Root mean square of the gradient along θ in a window, grey levels per pixel, (rows, cols).
+
+    Computed at half size and enlarged: it varies slowly.
+    """
+    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    gradient = cv2.Sobel(half, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 16)
+    mean = cv2.sqrt(cv2.boxFilter(cv2.multiply(gradient, gradient), -1, (window, window)))
+    return np.asarray(cv2.resize(mean, image.shape[::-1], interpolation=cv2.INTER_LINEAR))
+
+
+def gradient_sigma(image: Image8) -> Pixels:
+    """Standard deviation of a match in px from the image's structure alone."""
+    return np.asarray(_NOISE / (structure(image) + np.float32(0.3)) * 0.3 + _FLOOR, np.float32)
+
+
+def inverse_search(preset: str, finest_scale: int) -> Any:
+    """Dense inverse search flow (Kroeger et al. 2016): 'ultrafast', 'fast' or 'medium'.
+
+    finest_scale : halvings of the image at the finest level that is searched
+    """
+    presets = {'ultrafast': cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
+               'fast': cv2.DISOPTICAL_FLOW_PRESET_FAST,
+               'medium': cv2.DISOPTICAL_FLOW_PRESET_MEDIUM}
+    search = cv2.DISOpticalFlow_create(presets[preset])
+    search.setFinestScale(finest_scale)
+    return search
+
+
+def flow_matcher(preset: str, finest_scale: int) -> Matcher:
+    """Dense inverse search flow, kept where it is consistent.
+
+    A match stands if the flow back from the reference returns to within a pixel, and if it stays
+    on its meridian.
+    """
+    search = inverse_search(preset, finest_scale)
+
+    def match(current: Image8, reference: Image8) -> Parallax:
+        there = search.calc(current, reference, None)
+        back = search.calc(reference, current, None)
+        loop = _forth_and_back(there, back)
+        along, across = there[..., 0], there[..., 1]
+        sigma = cv2.magnitude(gradient_sigma(current), _FORTH_AND_BACK * loop)
+        wrong = (loop > 1) | (np.abs(across) > 1)
+        return Parallax(np.where(wrong, np.float32(np.nan), -along), sigma, signed=True)
+
+    return match
+
+
+def _forth_and_back(there: Pixels, back: Pixels) -> Pixels:
+    """Length of the loop from the current view to the reference and back, px."""
+    rows, columns = there.shape[:2]
+    u = there[..., 0] + np.arange(columns, dtype=np.float32)[None]
+    v = there[..., 1] + np.arange(rows, dtype=np.float32)[:, None]
+    returned = cv2.remap(back, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    loop = there + returned
+    return np.asarray(cv2.magnitude(np.ascontiguousarray(loop[..., 0]),
+                                    np.ascontiguousarray(loop[..., 1])))
+
+
+def _opencv_matcher(stereo: Any, disparities: int, block: int) -> Matcher:
+    """A StereoBM or StereoSGBM, padded: it leaves the first columns and the rim empty."""
+    left, rim = disparities + block // 2, block // 2
+
+    def match(current: Image8, reference: Image8) -> Parallax:
+        padded = [cv2.copyMakeBorder(im, rim, rim, left, rim, cv2.BORDER_REPLICATE)
+                  for im in (current, reference)]
+        disparity = stereo.compute(*padded)[rim:-rim, left:-rim]
+        pixels = np.where(disparity > 0, disparity * np.float32(1 / 16), np.float32(np.nan))
+        return Parallax(pixels, gradient_sigma(current), signed=False)
+
+    return match
+
+
+def block_matcher(disparities: int, block: int) -> Matcher:
+    """OpenCV's StereoBM, as in the paper."""
+    stereo = cv2.StereoBM_create(disparities, block)
+    stereo.setUniquenessRatio(10)
+    return _opencv_matcher(stereo, disparities, block)
+
+
+def semi_global_matcher(disparities: int, block: int) -> Matcher:
+    """OpenCV's StereoSGBM, three-way."""
+    stereo = cv2.StereoSGBM_create(
+        0, disparities, block, P1=2 * block * block, P2=16 * block * block, uniquenessRatio=5,
+        disp12MaxDiff=1, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY)
+    return _opencv_matcher(stereo, disparities, block)
+
+
+def matcher(config: StereoConfig) -> Matcher:
+    """The matcher that `config` names."""
+    if config.matcher == 'bm':
+        return block_matcher(config.num_disparities, config.block_size)
+    if config.matcher == 'sgbm':
+        return semi_global_matcher(config.num_disparities, min(config.block_size, 7))
+    return flow_matcher('fast', 1) if config.matcher == 'flow' else flow_matcher('ultrafast', 2)

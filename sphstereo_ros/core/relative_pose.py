@@ -1,0 +1,176 @@
+"""Relative pose from correspondences of bearings: RANSAC, then robust least squares.
+
+Residuals are angles between a bearing and its epipolar plane, so points ahead, behind and at the
+side count alike. Convention: X_cur = R X_ref + p; from correspondences |p| = 1.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import rotations
+from .five_point import decompose, essential_matrices
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Correspondences:
+    """The same points seen from two views: unit bearings (N, 3), each in its view's frame."""
+
+    reference: Floats
+    current: Floats
+
+    def __len__(self) -> int:
+        return len(self.reference)
+
+    def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.intp]) -> Correspondences:
+        return Correspondences(self.reference[index], self.current[index])
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """rotation (3, 3); direction p of the reference camera in the current frame, (3,), |p| = 1;
+    inliers (N,) bool; covariance (5, 5) of a small rotation (rad) and of the direction along its
+    `tangent` (3, 2); residual: robust standard deviation of the inliers, rad.
+    """
+
+    rotation: Floats
+    direction: Floats
+    inliers: NDArray[np.bool_]
+    covariance: Floats
+    residual: float
+
+    @property
+    def covariance6(self) -> Floats:
+        """Covariance (6, 6) of the small rotation and of the unit direction (3,)."""
+        spread = np.zeros((6, 5))
+        spread[:3, :3] = np.eye(3)
+        spread[3:, 3:] = tangent(self.direction)
+        return spread @ self.covariance @ spread.T
+
+
+def tangent(direction: Floats) -> Floats:
+    """Two unit vectors (3, 2) that span the plane normal to `direction`."""
+    u = np.linalg.svd(direction[:, None])[0]
+    return np.asarray(u[:, 1:])
+
+
+def epipolar_residuals(rotation: Floats, direction: Floats, points: Correspondences) -> Floats:
+    """Signed sine of the angle from each current bearing to its epipolar plane, (N,)."""
+    normal = np.cross(direction, points.reference @ rotation.T)
+    length = np.maximum(np.linalg.norm(normal, axis=1), 1e-9)
+    return np.asarray(np.einsum('na,na->n', points.current, normal) / length)
+
+
+def parallax(rotation: Floats, points: Correspondences) -> Floats:
+    """Angle between each current bearing and the rotated reference bearing, rad, (N,)."""
+    turned = points.reference @ rotation.T
+    return np.asarray(np.arctan2(np.linalg.norm(np.cross(turned, points.current), axis=1),
+                                 np.einsum('na,na->n', turned, points.current)))
+
+
+def in_front(rotation: Floats, direction: Floats, points: Correspondences) -> NDArray[np.bool_]:
+    """Which points lie on the positive side of both bearings, when triangulated, (N,) bool."""
+    turned = points.reference @ rotation.T
+    c = np.einsum('na,na->n', turned, points.current)
+    a = turned @ direction
+    b = points.current @ direction
+    # λ_cur · current = λ_ref · turned + p, least squares, common positive factor left out
+    return np.asarray(((b * c - a) > 0) & ((b - a * c) > 0))
+
+
+def _best_model(models: Floats, points: Correspondences, threshold: float) -> tuple[Floats, float]:
+    normal = np.einsum('mab,nb->mna', models, points.reference)
+    length = np.maximum(np.linalg.norm(normal, axis=2), 1e-9)
+    residual = np.einsum('mna,na->mn', normal, points.current) / length
+    cost = np.minimum((residual / threshold)**2, 1.0).mean(axis=1)  # MSAC
+    best = int(np.argmin(cost))
+    return models[best], float(cost[best])
+
+
+def ransac(points: Correspondences, threshold: float, rng: np.random.Generator, *,
+           batch: int = 48, max_batches: int = 12, scored: int = 600,
+           confidence: float = 0.999) -> tuple[Floats, Floats] | None:
+    """Rotation (3, 3) and direction (3,) with the most support, or None where nothing fits.
+
+    Parameters
+    ----------
+    points : at least five correspondences
+    threshold : angular residual of an inlier, rad
+    rng : decides the samples
+    batch, max_batches : samples at a time, and how often at most
+    scored : so many correspondences (drawn once) judge each model
+    confidence : that one sample without outliers was drawn
+
+    """
+    subset = points[rng.permutation(len(points))[:scored]]
+    best: Floats | None = None
+    lowest = np.inf
+    for tried in range(1, max_batches + 1):
+        sample = rng.integers(0, len(points), (batch, 5))
+        models = essential_matrices(points.reference[sample], points.current[sample])
+        if len(models):
+            model, cost = _best_model(models, subset, threshold)
+            if cost < lowest:
+                best, lowest = model, cost
+        # The MSAC cost is at least the share of outliers, so this asks for enough samples.
+        if (1 - max(1 - lowest, 0.0)**5)**(tried * batch) < 1 - confidence:
+            break
+    if best is None:
+        return None
+    poses = decompose(best)
+    support = points[np.abs(epipolar_residuals(*poses[0], points)) < threshold]
+    return max(poses, key=lambda pose: int(in_front(pose[0], pose[1], support).sum()))
+
+
+def _jacobian(rotation: Floats, direction: Floats, points: Correspondences,
+              basis: Floats) -> tuple[Floats, Floats]:
+    """Residuals (N,) and their derivatives (N, 5) by a left small rotation and the direction."""
+    turned = points.reference @ rotation.T
+    normal = np.cross(direction, turned)
+    length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    normal = normal / length
+    residual = np.einsum('na,na->n', points.current, normal)
+    h = (points.current - residual[:, None] * normal) / length
+    return residual, np.concatenate([np.cross(turned, np.cross(h, direction)),
+                                     np.cross(turned, h) @ basis], axis=1)
+
+
+def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iterations: int = 8,
+           weights: Floats | None = None, floor: float = 2e-5) -> PoseEstimate | None:
+    """Minimise the angular residuals with Tukey weights (Gauss–Newton on SO(3) × S²).
+
+    Parameters
+    ----------
+    rotation, direction : the start
+    points : correspondences, outliers among them
+    iterations : at most
+    weights : (N,) of each correspondence beforehand, default 1
+    floor : least standard deviation taken for the residuals, rad
+
+    Returns
+    -------
+    None where the correspondences do not fix five parameters.
+
+    """
+    prior = np.ones(len(points)) if weights is None else weights
+    scale, w = floor, prior
+    for _ in range(iterations):
+        basis = tangent(direction)
+        residual, jacobian = _jacobian(rotation, direction, points, basis)
+        scale = max(1.4826 * float(np.median(np.abs(residual))), floor)
+        w = prior * np.clip(1 - (residual / (4.685 * scale))**2, 0, None)**2
+        normal = (jacobian * w[:, None]).T @ jacobian
+        if not np.isfinite(normal).all() or np.linalg.cond(normal) > 1e10:
+            return None
+        step = -np.linalg.solve(normal, (jacobian * w[:, None]).T @ residual)
+        rotation = rotations.exp(step[:3]) @ rotation
+        direction = direction + basis @ step[3:]
+        direction = direction / np.linalg.norm(direction)
+        if np.abs(step).max() < 1e-8:
+            break
+    covariance = np.asarray(np.linalg.inv(normal) * scale**2, np.float64)
+    return PoseEstimate(rotation, direction, w > 0, covariance, scale)

@@ -1,0 +1,105 @@
+"""Stage 2, pose stabilisation: the rotation and the direction of motion of each reference."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import Config, PoseConfig
+from .frames import (
+    Drop,
+    Image8,
+    PairedWindow,
+    Reference,
+    RelativePose,
+    StabilisedWindow,
+)
+from .relative_pose import Correspondences, PoseEstimate, parallax, ransac, refine
+from .tracking import track
+
+
+def reduced(image: Image8, height: int) -> Image8:
+    """The image (H, 2H) shrunk to `height` rows, or itself if it is not larger."""
+    if image.shape[0] <= height:
+        return image
+    return np.asarray(cv2.resize(image, (2 * height, height), interpolation=cv2.INTER_AREA))
+
+
+def estimate(points: Correspondences, config: PoseConfig) -> PoseEstimate | Drop:
+    """Pose from correspondences, or the reason why there is none.
+
+    Drops: `too_few_points`, `too_few_inliers`, `no_parallax` (hover or pure rotation).
+    """
+    if len(points) < config.min_inliers:
+        return Drop('too_few_points', f'{len(points)} points with texture')
+    found = ransac(points, config.inlier_threshold, np.random.default_rng(config.seed))
+    pose = refine(*found, points) if found else None
+    if pose is None:
+        return Drop('too_few_inliers', 'no pose fits the correspondences')
+    inliers = int(pose.inliers.sum())
+    if inliers < max(config.min_inliers, config.min_inlier_ratio * len(points)):
+        return Drop('too_few_inliers', f'{inliers} of {len(points)}')
+    moved = float(np.median(parallax(pose.rotation, points[pose.inliers])))
+    if moved < config.min_parallax:
+        return Drop('no_parallax', f'median parallax {np.degrees(moved):.3f}°')
+    return pose
+
+
+class Stabiliser:
+    """Estimates the relative pose of every reference from the images."""
+
+    def __init__(self, config: Config, mask: Image8 | None = None) -> None:
+        self.config = config.pose
+        self._mask = mask
+
+    def warm_up(self) -> None:
+        """Compile what `process` needs."""
+        noise = np.random.default_rng(0).integers(0, 255, (64, 128), np.uint8)
+        track(noise, noise, np.diag([-1.0, 1, -1]), 200)
+
+    def process(self, window: PairedWindow) -> StabilisedWindow | Drop:
+        """Give every reference its rotation and direction; the baselines' lengths stay.
+
+        References that fail are left out; if none is left, the nearest one's failure is returned.
+        """
+        done = [self._reference(window, reference) for reference in window.references]
+        good = tuple(r for r in done if isinstance(r, Reference))
+        if good:
+            return StabilisedWindow(window.current, good)
+        return next(d for d in done if isinstance(d, Drop))
+
+    def _reference(self, window: PairedWindow, reference: Reference) -> Reference | Drop:
+        config = self.config
+        images = [reduced(frame.image, config.working_height)
+                  for frame in (reference.frame, window.current)]
+        if images[0].shape != images[1].shape:
+            return Drop('size_changed', f'{images[0].shape} and {images[1].shape}')
+        points = track(images[0], images[1], reference.pose.rotation, config.max_points,
+                       self._mask_like(images[1]))
+        pose = estimate(points, config)
+        if isinstance(pose, Drop):
+            return pose
+        return replace(reference, pose=with_length(pose, reference.pose))
+
+    def _mask_like(self, image: NDArray[np.uint8]) -> Image8 | None:
+        if self._mask is None:
+            return None
+        return np.asarray(cv2.resize(self._mask, image.shape[::-1],
+                                     interpolation=cv2.INTER_NEAREST))
+
+
+def with_length(pose: PoseEstimate, prior: RelativePose) -> RelativePose:
+    """The estimate with its direction made as long as the prior's baseline.
+
+    What the prior knows of the uncertainty of its length is kept.
+    """
+    length, along = prior.baseline, pose.direction
+    covariance = pose.covariance6
+    covariance[3:] *= length
+    covariance[:, 3:] *= length
+    if prior.covariance is not None:
+        unit = prior.position / max(length, 1e-300)
+        covariance[3:, 3:] += (unit @ prior.covariance[3:, 3:] @ unit) * np.outer(along, along)
+    return RelativePose(pose.rotation, length * along, covariance)

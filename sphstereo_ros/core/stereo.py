@@ -1,0 +1,68 @@
+"""Stage 4, spherical stereo: an aligned window becomes a range image."""
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from .config import Config
+from .frames import (
+    AlignedWindow,
+    Drop,
+    Frame,
+    FrameKey,
+    Image8,
+    RangeImage,
+    Reference,
+    RelativePose,
+)
+from .inverse_range import InverseRange, fuse, inverse_range, published_range
+from .matching import matcher
+from .warp import PolarGrid, aligned_pair
+
+_MARGIN, _WRAP = 16, 16
+
+
+class SphericalStereo:
+    """Matches each pair of a window along its meridians and fuses the ranges."""
+
+    def __init__(self, config: Config, mask: Image8 | None = None) -> None:
+        self.config = config
+        self._match = matcher(config.stereo)
+        self._mask = mask
+
+    def warm_up(self) -> None:
+        """Compile what `process` needs."""
+        noise = np.random.default_rng(0).integers(0, 255, (128, 256), np.uint8)
+        frames = [Frame(FrameKey(stamp, ''), noise) for stamp in range(2)]
+        pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -1.0]), 1e-9 * np.eye(6))
+        self.process(AlignedWindow(frames[1], (Reference(frames[0], pose),)))
+
+    def process(self, window: AlignedWindow) -> RangeImage | Drop:
+        """Range and sigma on the current frame's grid.
+
+        Drops: `size_changed`, where a reference has another size than the current frame;
+        `mixed_scale`, where only some baselines are metric.
+        """
+        height = window.current.image.shape[0]
+        if any(r.frame.image.shape != window.current.image.shape for r in window.references):
+            return Drop('size_changed', 'the frames of a window differ in size')
+        if len({r.pose.is_metric for r in window.references}) != 1:
+            return Drop('mixed_scale', 'some baselines of a window are metric, others are not')
+        estimate = fuse([self._measure(window.current, r) for r in window.references])
+        r, sigma = published_range(estimate, self.config.range, window.is_metric,
+                                   self._mask_of(height))
+        return RangeImage(window.current.key, r, sigma, window.is_metric)
+
+    def _measure(self, current: Frame, reference: Reference) -> InverseRange:
+        height = current.image.shape[0]
+        grid = PolarGrid(height, _MARGIN, _WRAP)
+        ref, cur, axes = aligned_pair(reference.frame.image, current.image, reference.pose, grid)
+        parallax = self._match(cur, ref)
+        return inverse_range(parallax, grid, axes, reference.pose, height,
+                             self.config.baseline.relative_sigma)
+
+    def _mask_of(self, height: int) -> Image8 | None:
+        if self._mask is not None and self._mask.shape[0] != height:
+            return np.asarray(cv2.resize(self._mask, (2 * height, height),
+                                         interpolation=cv2.INTER_NEAREST))
+        return self._mask
