@@ -20,6 +20,7 @@ class Noise:
     shot: float = 1.2
 
 
+NOISE = Noise()
 NO_NOISE = Noise(0.0, 0.0)
 
 

@@ -2,14 +2,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from itertools import pairwise
+from typing import Any, TypeAlias
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
-Mesh = trimesh.Trimesh
+Mesh: TypeAlias = trimesh.Trimesh
 Rectangle = tuple[float, float, float, float]
 
 
@@ -32,16 +33,22 @@ def moved(shape: Mesh, x: float = 0.0, y: float = 0.0, z: float = 0.0, yaw: floa
 
 def quads(corners: Array) -> Mesh:
     """Quads from their corners (n, 4, 3), in order round each."""
-    n = len(corners)
-    first = 4 * np.arange(n)[:, None]
-    faces = np.stack([first + (0, 1, 2), first + (0, 2, 3)], axis=1).reshape(-1, 3)
+    first = 4 * np.arange(len(corners))[:, None]
+    faces = (first + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3)
     return mesh(np.reshape(corners, (-1, 3)), faces)
 
 
-def box(low: Sequence[float], high: Sequence[float]) -> Mesh:
-    """The axis-aligned box between two corners."""
-    shape = trimesh.creation.box(np.subtract(high, low))
-    return mesh(shape.vertices + np.add(low, high) / 2, shape.faces)
+_CORNERS = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+_SIDES = np.array([(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1),
+                   (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)])
+
+
+def box(low: Any, high: Any) -> Mesh:
+    """The axis-aligned box between two corners (3,), or boxes between pairs of them (n, 3)."""
+    low, high = np.atleast_2d(low), np.atleast_2d(high)
+    points = low[:, None] + _CORNERS * (high - low)[:, None]
+    faces = 8 * np.arange(len(low))[:, None, None] + _SIDES
+    return mesh(points.reshape(-1, 3), faces.reshape(-1, 3))
 
 
 def sheet(x0: float, x1: float, y0: float, y1: float, z: float) -> Mesh:
@@ -102,8 +109,7 @@ def wall_with_holes(width: float, height: float, holes: Sequence[Rectangle],
     rects = np.array(holes, np.float64).reshape(-1, 4)
     xs = np.unique(np.concatenate([[0, width], rects[:, 0], rects[:, 1]]))
     zs = np.unique(np.concatenate([[0, height], rects[:, 2], rects[:, 3]]))
-    cells = np.array([(a, b, c, d) for c, d in zip(zs[:-1], zs[1:], strict=True)
-                      for a, b in zip(xs[:-1], xs[1:], strict=True)])
+    cells = np.array([(a, b, c, d) for c, d in pairwise(zs) for a, b in pairwise(xs)])
     middle_x, middle_z = cells[:, :2].mean(axis=1), cells[:, 2:].mean(axis=1)
     open_cell = np.zeros(len(cells), bool)
     for x0, x1, z0, z1 in rects:
@@ -119,21 +125,25 @@ def wall_with_holes(width: float, height: float, holes: Sequence[Rectangle],
 def window_frames(holes: Sequence[Rectangle], depth: float, bar: float,
                   rows: int, columns: int) -> Mesh:
     """Frames with glazing bars for the holes of a wall: `rows` × `columns` panes each."""
-    out = []
+    low, high = [], []
     for x0, x1, z0, z1 in holes:
         for i in range(columns + 1):
             x = x0 + (x1 - x0 - bar) * i / columns
-            out.append(box((x, depth - 0.04, z0), (x + bar, depth + 0.02, z1)))
+            low.append((x, depth - 0.04, z0))
+            high.append((x + bar, depth + 0.02, z1))
         for i in range(rows + 1):
             z = z0 + (z1 - z0 - bar) * i / rows
-            out.append(box((x0, depth - 0.04, z), (x1, depth + 0.02, z + bar)))
-    return joined(out)
+            low.append((x0, depth - 0.04, z))
+            high.append((x1, depth + 0.02, z + bar))
+    return box(low, high)
 
 
 def sills(holes: Sequence[Rectangle], reach: float = 0.12) -> Mesh:
     """Window sills under the holes of a wall."""
-    return joined([box((x0 - 0.1, -reach, z0 - 0.08), (x1 + 0.1, 0.05, z0))
-                   for x0, x1, z0, _ in holes])
+    x0, x1, z0, _ = np.array(holes).T
+    depth = np.ones(len(holes))
+    return box(np.stack([x0 - 0.1, -reach * depth, z0 - 0.08], -1),
+               np.stack([x1 + 0.1, 0.05 * depth, z0], -1))
 
 
 def gable_roof(length: float, depth: float, eaves: float, rise: float,
@@ -158,7 +168,7 @@ def gables(length: float, depth: float, eaves: float, rise: float) -> Mesh:
 def leaves(rng: np.random.Generator, centres: Array, size: float) -> Mesh:
     """A leaf, two triangles folded along its rib, at each of `centres` (n, 3); random poses."""
     n = len(centres)
-    rib = rng.normal(size=(n, 3)) + (0, 0, -0.4)
+    rib = rng.normal((0, 0, -0.4), 1, (n, 3))
     rib /= np.linalg.norm(rib, axis=1)[:, None]
     across = np.cross(rib, rng.normal(size=(n, 3)))
     across /= np.linalg.norm(across, axis=1)[:, None]
@@ -166,9 +176,7 @@ def leaves(rng: np.random.Generator, centres: Array, size: float) -> Mesh:
     length = size * rng.uniform(0.7, 1.3, (n, 1))
     corners = np.stack([centres - rib * length / 2, centres + (across + fold) * length / 3,
                         centres + rib * length / 2, centres + (fold - across) * length / 3], 1)
-    first = 4 * np.arange(n)[:, None]
-    faces = np.stack([first + (0, 1, 2), first + (0, 2, 3)], axis=1).reshape(-1, 3)
-    return mesh(corners.reshape(-1, 3), faces)
+    return quads(corners)
 
 
 def tree(rng: np.random.Generator, height: float, crown: float, leaf: float,
@@ -189,8 +197,8 @@ def tree(rng: np.random.Generator, height: float, crown: float, leaf: float,
         low = fork + (height * 0.7 - fork) * rng.uniform(0, 1) ** 1.3
         reach = crown * rng.uniform(0.55, 1.0)
         start = np.array([*(lean * low / fork), low])
-        end = start + (reach * np.cos(turn), reach * np.sin(turn),
-                       rng.uniform(0.15, 0.95) * (height - low))
+        end = start + np.array([reach * np.cos(turn), reach * np.sin(turn),
+                                rng.uniform(0.15, 0.95) * (height - low)])
         bend = (start + end) / 2 + rng.normal(0, 0.15, 3) - (0, 0, 0.1)
         wood.append(tube([start, bend, end], thick * np.array([0.4, 0.25, 0.07]), sides=6))
         twigs += [bend, end, (bend + end) / 2]

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -147,7 +148,7 @@ def _wires(build: Builder) -> None:
         for x in xs:
             build.add('mast', shapes.pole(float(x), y, 0.24, 8.4), surfaces.BARK, True)
         for height, offset in ((8.2, -0.3), (8.2, 0.3), (7.6, 0.0)):
-            for a, b in zip(xs[:-1], xs[1:], strict=True):
+            for a, b in pairwise(xs):
                 build.add('wire', shapes.wire((a, y + offset, height), (b, y + offset, height),
                                               0.5, 0.018), surfaces.WIRE)
     for x in rng.uniform(_FROM, _TO, 5):
