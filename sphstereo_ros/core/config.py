@@ -192,6 +192,23 @@ class PointsConfig:
 
 
 @dataclass(frozen=True)
+class ReplayConfig:
+    """The node `bag_replay`."""
+
+    bag: str = _p('replay.bag', '', 'bag, video or folder of frames to play', runtime=False)
+    topic: str = _p('replay.topic', '', 'image topic to play as `image`; empty = as recorded',
+                    runtime=False)
+    rate: float = _p('replay.rate', 1.0, 'speed, as a multiple of real time', low=0.001,
+                     high=1000.0, runtime=False)
+    loop: bool = _p('replay.loop', False, 'begin again at the end, with stamps that go on rising',
+                    runtime=False)
+    start_offset: float = _p('replay.start_offset', 0.0, 'how much of the beginning to leave out',
+                             unit='s', low=0.0, high=1e6, runtime=False)
+    wait: float = _p('replay.wait', 0.0, 'longest wait for a subscription before the start',
+                     unit='s', low=0.0, high=3600.0, runtime=False)
+
+
+@dataclass(frozen=True)
 class Config:
     """All groups."""
 
@@ -203,6 +220,7 @@ class Config:
     stereo: StereoConfig = StereoConfig()
     range: RangeConfig = RangeConfig()
     points: PointsConfig = PointsConfig()
+    replay: ReplayConfig = ReplayConfig()
 
 
 def _specs() -> Iterator[tuple[str, str, Parameter]]:

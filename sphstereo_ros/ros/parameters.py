@@ -15,7 +15,9 @@ NODE_PARAMETERS: dict[str, tuple[str, ...]] = {
     'motion_alignment': ('alignment.', 'camera.mask', 'pairing.'),
     'spherical_stereo': ('stereo.', 'range.', 'points.', 'camera.', 'baseline.relative_sigma',
                          'pairing.'),
-    'pipeline': ('',),
+    'pipeline': ('camera.', 'baseline.', 'pairing.', 'pose.', 'alignment.', 'stereo.', 'range.',
+                 'points.'),
+    'bag_replay': ('replay.',),
 }
 # Names that ROS itself declares on a node.
 ROS_NAMES = ('use_sim_time', 'start_type_description_service')
