@@ -1,0 +1,28 @@
+"""Stage 2 as a node: rotation and direction of motion of each reference."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sphstereo_ros.core.frames import PairedWindow, StabilisedWindow
+from sphstereo_ros.core.stabilisation import Stabiliser
+from sphstereo_ros.ros.conversions import window_message
+from sphstereo_ros.ros.live_messages import make
+from sphstereo_ros.ros.shell import Shell, run
+from sphstereo_ros.ros.stage import StageComponent, pose_values
+
+
+def build(shell: Shell, then: Callable[[StabilisedWindow, float], None] | None = None
+          ) -> StageComponent[PairedWindow, StabilisedWindow]:
+    """Make the component; `then` takes (window, arrival) in place of a subscriber."""
+    pairs = shell.output('nav_msgs/msg/Path', 'pairs/stabilised')
+
+    def deliver(_: PairedWindow, window: StabilisedWindow) -> dict[str, object]:
+        pairs.send(lambda: window_message(make, window))
+        return pose_values(window)
+    return StageComponent(shell, 'pose_stabilisation', PairedWindow, 'pairs', Stabiliser, deliver,
+                          then)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node `pose_stabilisation`; returns its exit status."""
+    return run('pose_stabilisation', lambda shell: [build(shell)], args)

@@ -1,0 +1,81 @@
+"""Stage 4 as a node: range on the current frame's grid, its sigma, and the cloud."""
+from __future__ import annotations
+
+import numpy as np
+
+from sphstereo_ros.core.cloud import point_cloud
+from sphstereo_ros.core.config import Config
+from sphstereo_ros.core.frames import AlignedWindow, Drop, Image8, RangeImage
+from sphstereo_ros.core.preview import colour_map
+from sphstereo_ros.core.stereo import SphericalStereo
+from sphstereo_ros.ros import qos
+from sphstereo_ros.ros.conversions import cloud_message, depth_message, image_message
+from sphstereo_ros.ros.live_messages import make
+from sphstereo_ros.ros.matching import Covariances
+from sphstereo_ros.ros.shell import Shell, run
+from sphstereo_ros.ros.stage import StageComponent
+
+
+class RangeOutputs:
+    """Publishes what is wanted of a range image."""
+
+    def __init__(self, shell: Shell) -> None:
+        self._shell = shell
+        image, large = 'sensor_msgs/msg/Image', qos.LARGE_RESULT
+        self._depth = shell.output(image, 'depth/image', large)
+        self._relative = shell.output(image, 'depth/relative', large)
+        self._sigma = shell.output(image, 'depth/sigma', large)
+        self._preview = shell.output(image, 'depth/preview', large)
+        self._points = shell.output('sensor_msgs/msg/PointCloud2', 'points', large)
+
+    def deliver(self, window: AlignedWindow, measured: RangeImage) -> dict[str, object]:
+        """Publish; without a metric baseline there is no depth in metres, and no cloud."""
+        key = measured.key
+        if measured.is_metric:
+            self._depth.send(lambda: depth_message(make, key, measured.range))
+            self._sigma.send(lambda: depth_message(make, key, measured.sigma))
+            self._points.send(lambda: cloud_message(
+                make, point_cloud(measured, window.current, self._shell.config)))
+        else:
+            self._relative.send(lambda: depth_message(make, key, measured.range))
+        self._preview.send(lambda: image_message(make, key, colour_map(measured)))
+        known = np.count_nonzero(~np.isnan(measured.range[::4, ::4])) * 16 / measured.range.size
+        return {'metric': measured.is_metric, 'coverage': f'{known:.3f}', **measured.quality}
+
+
+class StereoWithCovariances:
+    """The core's stage on windows that came without covariances."""
+
+    def __init__(self, config: Config, mask: Image8 | None, covariances: Covariances) -> None:
+        self._stereo = SphericalStereo(config, mask)
+        self._covariances = covariances
+
+    def warm_up(self) -> None:
+        """Compile what `process` needs."""
+        self._stereo.warm_up()
+
+    def process(self, window: AlignedWindow) -> RangeImage | Drop:
+        """Range and sigma."""
+        return self._stereo.process(self._covariances.attached(window))
+
+
+class SphericalStereoComponent(StageComponent[AlignedWindow, RangeImage]):
+    """Stage 4, which takes the poses' covariances from `odometry/visual` where they come."""
+
+    def __init__(self, shell: Shell) -> None:
+        self._covariances = Covariances()
+        super().__init__(
+            shell, 'spherical_stereo', AlignedWindow, 'pairs/aligned',
+            lambda config, mask: StereoWithCovariances(config, mask, self._covariances),
+            RangeOutputs(shell).deliver, colour=shell.config.points.colour)
+
+    def subscribe(self) -> None:
+        """Take frames, windows and visual odometry from the graph."""
+        self._shell.input('nav_msgs/msg/Odometry', 'odometry/visual', self._covariances.add,
+                          self.monitor)
+        super().subscribe()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node `spherical_stereo`; returns its exit status."""
+    return run('spherical_stereo', lambda shell: [SphericalStereoComponent(shell)], args)

@@ -1,0 +1,136 @@
+"""A core stage as a component: windows in, results out, in a thread of its own."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+
+from sphstereo_ros.core import rotations
+from sphstereo_ros.core.config import Config
+from sphstereo_ros.core.frames import Drop, FrameWindow, Image8
+from sphstereo_ros.ros.conversions import decode_frame, read_window
+from sphstereo_ros.ros.matching import WindowMatcher, frames_needed
+from sphstereo_ros.ros.shell import Shell
+
+In = TypeVar('In', bound=FrameWindow)
+Taken = TypeVar('Taken', bound=FrameWindow, contravariant=True)
+Out = TypeVar('Out', covariant=True)
+Made = TypeVar('Made')
+
+
+class Stage(Protocol[Taken, Out]):
+    """One step of the chain, as the core has it."""
+
+    def warm_up(self) -> None:
+        """Compile what `process` needs."""
+
+    def process(self, window: Taken) -> Out | Drop:
+        """Do the step."""
+
+
+# What `deliver` returns is told in /diagnostics.
+Deliver = Callable[[In, Made], dict[str, object]]
+
+
+class StageComponent(Generic[In, Made]):
+    """Runs a core stage on the newest window.
+
+    name : of the stage; kind : window type it takes; topic : where such windows come from
+    make_stage : (Config, mask) → stage
+    deliver : called in the stage's thread with (window, result); returns values to tell
+    then : called after it with (result, arrival): the next stage in this process
+    colour : whether frames are decoded in colour
+    """
+
+    def __init__(self, shell: Shell, name: str, kind: type[In], topic: str,
+                 make_stage: Callable[[Config, Image8 | None], Stage[In, Made]],
+                 deliver: Deliver[In, Made], then: Callable[[Made, float], None] | None = None,
+                 colour: bool = False) -> None:
+        self.monitor = shell.monitor(name)
+        self._shell = shell
+        self._topic = topic
+        self._colour = colour
+        self._make_stage = make_stage
+        self._deliver = deliver
+        self._then = then
+        self._stage = make_stage(shell.config, shell.mask)
+        self._matcher = WindowMatcher(kind, frames_needed(shell.config))
+        self._worker = shell.worker(name, self.monitor)
+
+    def warm_up(self) -> None:
+        """Compile what the stage needs."""
+        self._stage.warm_up()
+
+    def subscribe(self) -> None:
+        """Take frames and windows from the graph."""
+        self._shell.input('sensor_msgs/msg/Image', 'frames', self._take_frame, self.monitor)
+        self._shell.input('nav_msgs/msg/Path', self._topic, self._take_window, self.monitor)
+
+    def configure(self, config: Config) -> None:
+        """Make the stage anew with `config`, once the running window is done."""
+        self._matcher.size = frames_needed(config)
+
+        def exchange() -> None:
+            stage = self._make_stage(config, self._shell.mask)
+            stage.warm_up()
+            self._stage = stage
+        self._worker.put(exchange)
+
+    def hand_over(self, window: In, arrival: float) -> None:
+        """Take a window from the stage before, in this process; waits while one is in the queue.
+        """
+        self.monitor.arrived()
+        self._worker.put_when_free(partial(self._process, window, arrival))
+
+    def offer(self, window: In, arrival: float) -> None:
+        """Take a window; it replaces one that still waits."""
+        self.monitor.arrived()
+        self._worker.put_newest(partial(self._process, window, arrival))
+
+    def _take_frame(self, message: Any) -> None:
+        frame = decode_frame(message, colour=self._colour)
+        if isinstance(frame, Drop):
+            self.monitor.dropped(frame)
+        else:
+            self._settle(self._matcher.add_frame(frame))
+
+    def _take_window(self, message: Any) -> None:
+        arrival = self.monitor.arrived()
+        window = read_window(message)
+        if isinstance(window, Drop):
+            self.monitor.dropped(window)
+        else:
+            self._settle(self._matcher.add_window(window, arrival))
+
+    def _settle(self, decided: list[tuple[In | Drop, float]]) -> None:
+        for window, arrival in decided:
+            if isinstance(window, Drop):
+                self.monitor.dropped(window)
+            else:
+                self._worker.put_newest(partial(self._process, window, arrival))
+
+    def _process(self, window: In, arrival: float) -> None:
+        result = self._stage.process(window)
+        if isinstance(result, Drop):
+            self.monitor.dropped(result)
+            return
+        values = self._deliver(window, result)
+        self.monitor.published(arrival, values)
+        if self._then is not None:
+            self._then(result, arrival)
+
+
+def pose_values(window: FrameWindow) -> dict[str, object]:
+    """What /diagnostics tells of a window's poses."""
+    nearest = window.references[0].pose
+    values: dict[str, object] = {
+        'references': len(window.references),
+        'baseline_m': ' '.join(f'{r.pose.baseline:.3f}' if r.pose.is_metric else 'unknown'
+                               for r in window.references),
+        'rotation_deg': f'{np.degrees(rotations.angle(nearest.rotation)):.3f}'}
+    if nearest.covariance is not None:
+        sigma = np.degrees(np.sqrt(np.trace(nearest.covariance[:3, :3])))
+        values['rotation_sigma_deg'] = f'{sigma:.4f}'
+    return values
