@@ -41,7 +41,7 @@ class Parameter:
     def checked(self, value: object) -> Value:
         """Return `value` in this parameter's type, or raise ParameterError with the reason."""
         if self.is_array:
-            if not isinstance(value, Sequence) or isinstance(value, str) or not value:
+            if not isinstance(value, Sequence) or isinstance(value, (str, bytes)) or not value:
                 raise ParameterError(f'{self.name}: needs a non-empty list, not {value!r}')
             return tuple(self._scalar(v) for v in value)  # type: ignore[return-value]
         return self._scalar(value)
@@ -75,9 +75,12 @@ class CameraConfig:
                     choices=('equirectangular',), runtime=False)
     mask: str = _p('camera.mask', '', 'image file, non-zero = vehicle: unknown there',
                    runtime=False)
-    mount_x: float = _p('camera.mount.x', 0.0, 'camera_link in base_link, forward', unit='m')
-    mount_y: float = _p('camera.mount.y', 0.0, 'camera_link in base_link, left', unit='m')
-    mount_z: float = _p('camera.mount.z', 0.0, 'camera_link in base_link, up', unit='m')
+    mount_x: float = _p('camera.mount.x', 0.0, 'camera_link in base_link, forward', unit='m',
+                        low=-1000.0, high=1000.0)
+    mount_y: float = _p('camera.mount.y', 0.0, 'camera_link in base_link, left', unit='m',
+                        low=-1000.0, high=1000.0)
+    mount_z: float = _p('camera.mount.z', 0.0, 'camera_link in base_link, up', unit='m',
+                        low=-1000.0, high=1000.0)
     mount_roll: float = _p('camera.mount.roll', 0.0, 'R = Rz(yaw) Ry(pitch) Rx(roll)', unit='rad',
                            low=-math.pi, high=math.pi)
     mount_pitch: float = _p('camera.mount.pitch', 0.0, 'see camera.mount.roll', unit='rad',
@@ -133,7 +136,8 @@ class PoseConfig:
     min_parallax: float = _p('pose.min_parallax', 0.0015, 'median parallax without rotation '
                              'under which a pair is a hover or a pure rotation', unit='rad',
                              low=0.0, high=1.0)
-    seed: int = _p('pose.seed', 1, 'of the random samples: the same input gives the same output')
+    seed: int = _p('pose.seed', 1, 'of the random samples: the same input gives the same output',
+                   low=0)
 
 
 @dataclass(frozen=True)
