@@ -1,0 +1,327 @@
+"""What nodes are made of, without a ROS graph: monitor, worker, matching of windows."""
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sphstereo_ros.core import rotations
+from sphstereo_ros.core.config import resolve
+from sphstereo_ros.core.frames import (
+    AlignedWindow,
+    Drop,
+    Frame,
+    FrameKey,
+    PairedWindow,
+    Reference,
+    RelativePose,
+)
+from sphstereo_ros.replay import bag_messages
+from sphstereo_ros.ros.conversions import WindowGeometry, odometry_message
+from sphstereo_ros.ros.matching import (
+    MAX_PENDING,
+    Covariances,
+    WindowMatcher,
+    frames_needed,
+)
+from sphstereo_ros.ros.monitor import ERROR, OK, STALL, WARN, Monitor
+from sphstereo_ros.ros.transport import PROFILE, prepare_process
+from sphstereo_ros.ros.worker import Worker
+
+DEADLINE = 10.0
+
+
+class FakeClock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+# Monitor
+
+def test_monitor_counts_rates_latency_and_drops() -> None:
+    clock, told = FakeClock(), []
+    monitor = Monitor('stage', clock, told.append)
+    assert (monitor.status().level, monitor.status().message) == (OK, 'waiting for input')
+    for latency in (0.1, 0.2, 0.3):
+        clock.now += 0.2
+        arrival = monitor.arrived()
+        clock.now += latency
+        monitor.published(arrival, {'inliers': 7})
+    monitor.arrived()
+    monitor.dropped(Drop('too_few_inliers', '3 of 90'))
+    monitor.dropped(Drop('too_few_inliers', '4 of 90'))
+    clock.now = 102.0
+    status = monitor.status()
+    assert status.level == WARN
+    assert status.message == 'dropped: 2 too_few_inliers'
+    values = status.values
+    assert (values['frames_in'], values['frames_out'], values['drops']) == (4, 3, 2)
+    assert (values['rate_in'], values['rate_out']) == ('2.00', '1.50')
+    assert (values['latency_p50_ms'], values['latency_p95_ms']) == ('200.00', '290.00')
+    assert values['drops.too_few_inliers'] == 2
+    assert values['last_drop'] == 'too_few_inliers: 4 of 90'
+    assert values['inliers'] == 7
+    assert float(str(values['memory_mb'])) > 1
+    assert [drop.detail for drop in told] == ['3 of 90']
+    clock.now += 1
+    status = monitor.status()
+    assert (status.level, status.message) == (OK, 'running')
+    assert status.values['rate_in'] == '0.00'
+
+
+def test_monitor_sees_stalls_and_errors() -> None:
+    clock = FakeClock()
+    monitor = Monitor('stage', clock)
+    monitor.arrived()
+    clock.now += STALL + 0.5
+    assert monitor.status().message == 'stalled: no input for 2.5 s'
+    monitor.arrived()
+    status = monitor.status()
+    assert (status.level, status.message) == (WARN, 'stalled: no output for 2.5 s')
+    monitor.dropped(Drop('internal_error', 'ValueError: x'))
+    assert monitor.status().level == ERROR
+    monitor.published(clock.now)
+    assert monitor.status().level == OK
+
+
+def test_monitor_does_not_warn_of_what_must_be() -> None:
+    monitor = Monitor('stage', FakeClock())
+    monitor.arrived()
+    monitor.dropped(Drop('first_frame'))
+    status = monitor.status()
+    assert (status.level, status.values['drops.first_frame']) == (OK, 1)
+
+
+# Worker
+
+class Blocked:
+    """A worker whose first job holds it until `release` is called."""
+
+    def __init__(self, capacity: int = 1) -> None:
+        self.done: list[str] = []
+        self.errors: list[Exception] = []
+        self.superseded = 0
+        self._open, self._entered = threading.Event(), threading.Event()
+        self.worker = Worker('test', self._count, self.errors.append, capacity)
+        self.worker.put(self._hold)
+        assert self._entered.wait(DEADLINE)
+
+    def _hold(self) -> None:
+        self._entered.set()
+        assert self._open.wait(DEADLINE)
+
+    def _count(self) -> None:
+        self.superseded += 1
+
+    def job(self, name: str) -> object:
+        return lambda: self.done.append(name)
+
+    def release(self) -> list[str]:
+        """Let all jobs run; returns what was done."""
+        finished = threading.Event()
+        self.worker.put(finished.set)
+        self._open.set()
+        assert finished.wait(DEADLINE)
+        self.worker.stop()
+        return self.done
+
+
+@pytest.mark.parametrize(('capacity', 'expected'), [(1, ['x', '4']), (3, ['x', '2', '3', '4'])])
+def test_worker_keeps_the_newest_and_all_that_must_run(capacity: int,
+                                                       expected: list[str]) -> None:
+    blocked = Blocked(capacity)
+    blocked.worker.put(blocked.job('x'))
+    for i in range(5):
+        blocked.worker.put_newest(blocked.job(str(i)))
+    assert blocked.release() == expected
+    assert blocked.superseded == 5 - capacity
+
+
+def test_worker_survives_a_failing_job() -> None:
+    blocked = Blocked()
+    blocked.worker.put(lambda: [].pop())
+    blocked.worker.put(blocked.job('after'))
+    assert blocked.release() == ['after']
+    assert [type(e) for e in blocked.errors] == [IndexError]
+
+
+def test_worker_makes_a_producer_wait() -> None:
+    blocked = Blocked()
+    blocked.worker.put_when_free(blocked.job('a'))
+    second = threading.Thread(target=blocked.worker.put_when_free, args=(blocked.job('b'),))
+    second.start()
+    second.join(0.1)
+    assert second.is_alive()
+    blocked._open.set()
+    second.join(DEADLINE)
+    assert not second.is_alive()
+    assert blocked.release() == ['a', 'b']
+    assert blocked.superseded == 0
+
+
+def test_worker_stops_a_waiting_producer() -> None:
+    blocked = Blocked()
+    blocked.worker.put_when_free(blocked.job('a'))
+    second = threading.Thread(target=blocked.worker.put_when_free, args=(blocked.job('b'),))
+    second.start()
+    blocked.worker.stop(timeout=0)
+    second.join(DEADLINE)
+    assert not second.is_alive()
+    blocked._open.set()
+
+
+# Matching
+
+def frame(stamp: int) -> Frame:
+    return Frame(FrameKey(stamp, 'c'), np.full((2, 4), stamp % 256, np.uint8))
+
+
+def geometry(*stamps: int) -> WindowGeometry:
+    """A window of these stamps, current first."""
+    pose = RelativePose(position=np.array([0, 0, -1.0]))
+    current, *others = (FrameKey(stamp, 'c') for stamp in stamps)
+    return WindowGeometry(current, tuple((key, pose) for key in others))
+
+
+def stamps(decided: list[tuple[PairedWindow | Drop, float]]) -> list[object]:
+    return [w.cause if isinstance(w, Drop) else
+            (w.current.key.stamp, *(r.frame.key.stamp for r in w.references))
+            for w, _ in decided]
+
+
+def test_window_waits_for_its_frames() -> None:
+    matcher = WindowMatcher(PairedWindow, 5)
+    assert matcher.add_frame(frame(1)) == []
+    assert matcher.add_window(geometry(2, 1), 7.5) == []
+    (window, arrival), = matcher.add_frame(frame(2))
+    assert isinstance(window, PairedWindow)
+    assert arrival == 7.5
+    assert window.current.image[0, 0] == 2
+    assert window.references[0].frame.image[0, 0] == 1
+    assert stamps(matcher.add_window(geometry(2, 1), 8.0)) == [(2, 1)]
+
+
+def test_window_without_its_frame_is_dropped_when_a_later_one_is_complete() -> None:
+    matcher = WindowMatcher(PairedWindow, 5)
+    matcher.add_frame(frame(2))
+    assert matcher.add_window(geometry(2, 1), 0.0) == []
+    assert matcher.add_frame(frame(3)) == []
+    assert stamps(matcher.add_window(geometry(3, 2), 0.0)) == ['frame_missing', (3, 2)]
+
+
+def test_windows_that_wait_are_bounded() -> None:
+    matcher = WindowMatcher(PairedWindow, 5)
+    decided = []
+    for stamp in range(MAX_PENDING + 2):
+        decided += matcher.add_window(geometry(stamp + 1, stamp), 0.0)
+    assert stamps(decided) == ['frame_missing'] * 2
+
+
+def test_frames_kept_are_bounded() -> None:
+    matcher = WindowMatcher(PairedWindow, 3)
+    for stamp in range(10):
+        matcher.add_frame(frame(stamp))
+    assert matcher.add_window(geometry(9, 6), 0.0) == []
+    assert stamps(matcher.add_window(geometry(9, 7), 0.0)) == ['frame_missing', (9, 7)]
+
+
+def test_another_frame_id_is_another_frame() -> None:
+    matcher = WindowMatcher(PairedWindow, 3)
+    matcher.add_frame(Frame(FrameKey(1, 'other'), np.zeros((2, 4), np.uint8)))
+    matcher.add_frame(frame(2))
+    assert matcher.add_window(geometry(2, 1), 0.0) == []
+
+
+@given(st.permutations(range(12)))
+def test_any_order_of_arrival_gives_the_same_windows(order: list[int]) -> None:
+    """Frames and windows in any order: a window comes out once its frames are there, or a later
+    one does; none is told of twice.
+    """
+    matcher = WindowMatcher(PairedWindow, 20)
+    decided: list[tuple[PairedWindow | Drop, float]] = []
+    for event in order:
+        if event < 6:
+            decided += matcher.add_frame(frame(event))
+        elif event < 11:
+            decided += matcher.add_window(geometry(event - 5, event - 6), float(event))
+    assert len(decided) + len(matcher._pending) == 5
+    for window, arrival in decided:
+        if not isinstance(window, Drop):
+            assert window.current.key.stamp == arrival - 5
+
+
+def test_frames_needed_follow_the_pairing() -> None:
+    assert frames_needed(resolve({'pairing.intervals': (4, 10)})) == 18
+    assert frames_needed(resolve({'pairing.baselines': (1.0,), 'baseline.length': 0.3})) == 108
+
+
+# Covariances by visual odometry
+
+def aligned(covariance: np.ndarray | None, length: float = 0.3) -> AlignedWindow:
+    pose = RelativePose(rotations.exp([0.1, -0.2, 0.3]), length * np.array([0.36, 0.48, -0.8]),
+                        covariance)
+    far = RelativePose(position=np.array([0.0, 0.0, -1.0]))
+    return AlignedWindow(frame(2_000_000_000), (Reference(frame(1_000_000_000), pose),
+                                                Reference(frame(0), far)))
+
+
+def spread() -> np.ndarray:
+    root = np.random.default_rng(3).normal(size=(6, 6)) * 1e-3
+    return root @ root.T
+
+
+def test_covariance_survives_the_way_by_odometry() -> None:
+    covariances = Covariances()
+    covariances.add(odometry_message(bag_messages.make, aligned(spread())))
+    window = covariances.attached(aligned(None))
+    np.testing.assert_allclose(window.references[0].pose.covariance, spread(), rtol=1e-9)
+    assert window.references[1].pose.covariance is None
+    own = covariances.attached(aligned(np.eye(6)))
+    np.testing.assert_array_equal(own.references[0].pose.covariance, np.eye(6))
+
+
+@pytest.mark.parametrize('told', [aligned(None), aligned(spread(), 1e-6)])
+def test_unknown_covariance_stays_unknown(told: AlignedWindow) -> None:
+    covariances = Covariances()
+    covariances.add(odometry_message(bag_messages.make, told))
+    assert covariances.attached(aligned(None)).references[0].pose.covariance is None
+
+
+def test_covariances_are_bounded() -> None:
+    covariances = Covariances(size=2)
+    for seconds in (2, 3, 4):
+        message = odometry_message(bag_messages.make, aligned(spread()))
+        message.header.stamp.sec = seconds
+        covariances.add(message)
+    assert covariances.attached(aligned(None)).references[0].pose.covariance is None
+
+
+# Transport
+
+def test_profile_is_loaded_unless_the_user_chose_one() -> None:
+    environment: dict[str, str] = {}
+    prepare_process(environment)
+    assert environment == {'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE)}
+    for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS'):
+        chosen = {name: 'mine'}
+        prepare_process(chosen)
+        assert chosen == {name: 'mine'}
+
+
+def test_profile_holds_what_a_process_has_under_way() -> None:
+    import xml.etree.ElementTree as xml
+    tree = xml.fromstring(Path(PROFILE).read_text())
+
+    def number(name: str) -> int:
+        return int(next(e.text for e in tree.iter() if e.tag.endswith(name)))
+    pixels = 1920 * 960
+    outputs = 3 * (4 * pixels + 4 * pixels + 8_000_000 + 3 * pixels) + 5 * 3 * pixels
+    assert number('segment_size') > outputs
+    assert number('port_queue_capacity') * 65500 >= outputs
