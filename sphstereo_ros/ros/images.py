@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sphstereo_ros.core.config import ParameterError
 from sphstereo_ros.core.frames import Drop, Frame, FrameKey, Image8
 from sphstereo_ros.ros.messages import MessageFactory, bad_stamp, frame_key, header
 
@@ -251,6 +252,23 @@ def _jpeg_size(data: bytes) -> CompressedSize | Drop:
             return size
         at += 2 + int.from_bytes(data[at + 2:at + 4], 'big')
     return Drop('undecodable_image', 'no JPEG header')
+
+
+def read_mask(path: str) -> Image8 | None:
+    """Read `camera.mask`: (H, W), non-zero = vehicle; None for an empty path.
+
+    Raises
+    ------
+    ParameterError
+        where it is no image
+
+    """
+    if not path:
+        return None
+    mask = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+    if mask is None:
+        raise ParameterError(f'camera.mask: cannot read an image from {path}')
+    return np.asarray(mask, np.uint8)
 
 
 def image_message(make: MessageFactory, key: FrameKey, image: Image8) -> Any:
