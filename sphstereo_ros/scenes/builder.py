@@ -61,6 +61,7 @@ class Builder:
         put('side', shapes.quads(np.array([[a, b, b + up, a + up] for a, b in zip(
             np.array(corners[:-1]), np.array(corners[1:]), strict=True)])), side)
         self._roof(put, size, material)
+        self._trim(put, size, holes, storeys)
         pipe = float(rng.choice([0.15, width - 0.15]))
         put('pipe', shapes.pole(pipe, -0.09, 0.09, height), surfaces.METAL, True)
 
@@ -84,6 +85,30 @@ class Builder:
                 holes.append((x - half, x + half, low, low + min(tall, rise - 1.05)
                               if low > 0.2 else low + tall))
         return holes
+
+    def _trim(self, put: object, size: tuple[float, float, float], holes: list[Rectangle],
+              storeys: int) -> None:
+        """Plinth, cornices, and now and then balconies with thin railings."""
+        assert callable(put)
+        rng, (width, _, height) = self.rng, size
+        doors = sorted(h[:2] for h in holes if h[2] < 0.2)
+        edges = [0.0, *(e for d in doors for e in d), width]
+        put('plinth', shapes.joined([shapes.box((a, -0.04, 0), (b, 0.02, 0.5))
+                                     for a, b in zip(edges[::2], edges[1::2], strict=True)]),
+            surfaces.CONCRETE)
+        if rng.random() < 0.5:
+            levels = [(height - 0.6) * k / storeys + 0.35 for k in range(1, storeys)] or [height]
+            put('cornice', shapes.joined([shapes.box((0, -0.08, z), (width, 0.02, z + 0.14))
+                                          for z in levels]), surfaces.CONCRETE)
+        if rng.random() > 0.4:
+            return
+        for x0, x1, z0, _ in holes:
+            if z0 > 3 and rng.random() < 0.6:
+                z = z0 - 0.3
+                put('balcony', shapes.box((x0 - 0.4, -0.9, z), (x1 + 0.4, 0.02, z + 0.12)),
+                    surfaces.CONCRETE)
+                put('railing', shapes.railing(x0 - 0.4, x1 + 0.4, 0.88, z + 0.12),
+                    surfaces.DARK_METAL)
 
     def _roof(self, put: object, size: tuple[float, float, float], material: Material) -> None:
         assert callable(put)
@@ -134,7 +159,9 @@ class Builder:
         self.add('post', shapes.pole(x, y, diameter, 2.8), surfaces.METAL, True)
         colour = ((0.45, 0.02, 0.02), (0.02, 0.06, 0.3), (0.6, 0.45, 0.02))[
             self.rng.integers(3)]
-        plate = replace(surfaces.METAL, colour=colour, seed=int(self.rng.integers(1 << 20)))
+        plate = replace(surfaces.METAL, colour=colour, block=(0.11, 0.09), block_variation=0.7,
+                        joint_colour=(0.6, 0.6, 0.6), joint=0.012,
+                        seed=int(self.rng.integers(1 << 20)))
         self.add('plate', shapes.box((x - diameter / 2 - 0.01, y - 0.32, 2.1),
                                      (x - diameter / 2, y + 0.32, 2.74)), plate)
 

@@ -17,7 +17,7 @@ class Material:
     """A surface. Colours are linear RGB reflectances, sizes in metres.
 
     The layers, in this order: `colour` stained towards `stain_colour` by soft noise; grain (noise
-    in octaves from `grain_size` down to `grain_fine`); blocks (bricks, slabs, tiles) with joints;
+    in octaves from `grain_size` down to `grain_fine`); cracks; blocks (bricks, slabs, tiles) with joints;
     a different brightness for each face (leaves); dirt near the object's z = 0. Then the gloss:
     a Blinn highlight of the lights, and a mirror image of the scene weighted by Fresnel's law.
     """
@@ -31,6 +31,8 @@ class Material:
     grain_fine: float = 0.002
     grain_gain: float = 0.6      # amplitude from octave to octave
     stretch: Colour = (1.0, 1.0, 1.0)  # of the grain along the object's axes
+    crack: float = 0.0           # width of cracks; 0 = none
+    crack_size: float = 1.5
     block: tuple[float, float] = (0.0, 0.0)  # 0 = no blocks
     block_offset: float = 0.5    # of every second row, in blocks
     block_variation: float = 0.0

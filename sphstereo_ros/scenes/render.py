@@ -23,11 +23,12 @@ def _grid(count: int) -> NDArray[np.float64]:
     return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
 
 
-def radiance(scene: Scene, origins: Array, rays: Array, angle: float,
+def radiance(scene: Scene, origins: Array, rays: Array, angle: float, samples: int = 1,
              travelled: Array | None = None) -> tuple[Array, Array]:
     """Linear RGB (n, 3) float32 along `rays` (n, 3) from `origins` (n, 3), and the faces (n,) hit.
 
-    angle : of a pixel, rad; travelled : (n,) metres already behind a ray that was mirrored
+    angle : of a pixel, rad; samples : that many consecutive rays belong to a pixel;
+    travelled : (n,) metres already behind a ray that was mirrored
     """
     count = len(rays)
     hits = scene.cast(origins, rays)
@@ -35,7 +36,7 @@ def radiance(scene: Scene, origins: Array, rays: Array, angle: float,
     shadow_from, shadow_to = np.empty((count, 3)), np.empty((count, 3))
     mirror_rays = np.empty((count, 3))
     shadow_length, mirror = np.empty(count), np.empty(count)
-    shade(0, count, origins, rays, hits.distance,
+    shade(samples, origins, rays, hits.distance,
           np.zeros(count) if travelled is None else travelled, angle, hits.face, hits.corners,
           scene.normals, scene.corner_normals, scene.face_part, scene.placements, scene.materials,
           scene.light_record, scene.lamps, base, direct, shadow_from, shadow_to, shadow_length,
@@ -46,7 +47,7 @@ def radiance(scene: Scene, origins: Array, rays: Array, angle: float,
         base[lit] += np.where(blocked[:, None], np.float32(0), direct[lit])
     shiny = np.flatnonzero(mirror > 0)
     if len(shiny) and travelled is None:
-        image, _ = radiance(scene, shadow_from[shiny], mirror_rays[shiny], angle,
+        image, _ = radiance(scene, shadow_from[shiny], mirror_rays[shiny], angle, 1,
                             hits.distance[shiny])
         weight = mirror[shiny, None].astype(np.float32)
         base[shiny] = (1 - weight) * base[shiny] + weight * np.minimum(image, 4.0)
@@ -97,7 +98,8 @@ class Camera:
 
     def _sampled(self, pixels: Array, samples: int) -> tuple[Array, Array]:
         rays = self._rays(pixels, _grid(samples))
-        colour, face = radiance(self.scene, self._origins(len(rays)), rays, np.pi / self.height)
+        colour, face = radiance(self.scene, self._origins(len(rays)), rays, np.pi / self.height,
+                                samples**2)
         part = np.where(face < 0, -1, self.scene.face_part[face])
         # Clipped before the average, as a lens' glare would not be: keeps highlights' edges soft.
         colour = np.minimum(colour, 3.0)

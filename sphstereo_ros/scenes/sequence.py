@@ -329,6 +329,6 @@ def load_sequence(folder: str | Path) -> SavedSequence:
     return SavedSequence(folder)
 
 
-__all__ = ['NOISE', 'NO_NOISE', 'REPORTED_SEEDS', 'SCENES', 'TUNING_SEEDS', 'ImageEffects', 'Noise',
-           'RenderedSequence', 'SavedSequence', 'TruthFrame', 'load_sequence', 'render_sequence',
-           'save_sequence', 'true_pose']
+__all__ = ['NOISE', 'NO_NOISE', 'REPORTED_SEEDS', 'SCENES', 'TUNING_SEEDS', 'ImageEffects',
+           'Noise', 'RenderedSequence', 'SavedSequence', 'TruthFrame', 'load_sequence',
+           'render_sequence', 'save_sequence', 'true_pose']

@@ -17,6 +17,8 @@ Array = NDArray[Any]
 
 NO_HIT = -1
 _SHADOW_LIFT = 2e-3  # metres by which a shadow ray starts off its surface
+_SUN_RADIUS = 0.0046  # rad
+_GOLDEN = 2.399963229728653
 
 
 @kernel
@@ -126,11 +128,24 @@ def _blocks(material: Any, u: float, v: float, fu: float, fv: float, colour: Arr
 
 
 @fast_kernel
+def _crack(material: Any, x: float, y: float, z: float, footprint: float) -> float:
+    """Share (0 … 1) of the footprint that lies in a crack: where soft noise crosses zero."""
+    size = material.crack_size
+    if octaves(x, y, z, 3 * size, 3 * size, 1.0, 1e-3, material.seed + 31) < -0.1:
+        return 0.0
+    level = octaves(x, y, z, size, 0.06 * size, 0.5, 1e-3, material.seed + 37)
+    beside = 0.3 * size * abs(level)  # about the distance in metres
+    cover = min(1.0, max(0.0, (0.5 * material.crack - beside) / footprint + 0.5))
+    return 0.7 * cover * min(1.0, material.crack / footprint)
+
+
+@fast_kernel
 def texture(material: Any, point: Array, normal: Array, view: Array, footprint: float, face: int,
             colour: Array) -> None:
     """Reflectance `colour` (3,) at `point`; `view` and `normal` in the object's axes too."""
     cosine = max(0.03, abs(view[0] * normal[0] + view[1] * normal[1] + view[2] * normal[2]))
-    wide = footprint / cosine
+    # Between the ellipse's axes; the few rays a pixel make up for its length.
+    wide = footprint / cosine**0.75
     x, y, z = point[0], point[1], point[2]
     stain = 0.0
     if material.stain > 0:
@@ -149,6 +164,8 @@ def texture(material: Any, point: Array, normal: Array, view: Array, footprint: 
         soil = 0.5 + 0.5 * _noise(2 * x, 2 * y, 1.5 * z, material.seed + 9)
         tone *= 1 - material.dirt * soil * math.exp(-max(z, 0.0) / 0.5)
     tone = min(2.0, max(0.15, tone))
+    if material.crack > 0 and wide < 8 * material.crack:
+        tone *= 1 - _crack(material, x, y, z, wide)
     for c in range(3):
         colour[c] = tone * ((1 - stain) * material.colour[c] + stain * material.stain_colour[c])
     if material.block[0] > 0:
@@ -243,21 +260,33 @@ def _highlight(ray: Array, normal: Array, toward: Array, material: Any) -> float
 
 
 @fast_kernel
-def shade(first: int, last: int, origins: Array, rays: Array, distance: Array, travelled: Array,
+def _sunward(light: Any, sample: int, samples: int, toward: Array) -> None:
+    """The direction to one of `samples` points of the sun's disc: shadows get soft edges."""
+    radius = _SUN_RADIUS * math.sqrt((sample + 0.5) / samples)
+    a, b = radius * math.cos(_GOLDEN * sample), radius * math.sin(_GOLDEN * sample)
+    x, y, z = light.sun[0], light.sun[1], light.sun[2]
+    flat = math.sqrt(x * x + y * y)
+    toward[0] = x + (-a * y - b * z * x) / flat
+    toward[1] = y + (a * x - b * z * y) / flat
+    toward[2] = z + b * flat
+
+
+@fast_kernel
+def shade(samples: int, origins: Array, rays: Array, distance: Array, travelled: Array,
           angle: float, faces: Array, corners: Array, face_normals: Array, corner_normals: Array,
           face_part: Array, placements: Array, materials: Array, light: Any, lamps: Array,
           base: Array, direct: Array, shadow_from: Array, shadow_to: Array, shadow_length: Array,
           mirror: Array, mirror_rays: Array) -> None:
     """Shade the hits of `rays` (n, 3).
 
-    Writes radiance that needs no more rays to `base` (n, 3), what the shadow ray decides over to
+    `samples` consecutive rays belong to one pixel. Writes radiance that needs no more rays to `base` (n, 3), what the shadow ray decides over to
     `direct` (n, 3) with the ray itself in `shadow_*` (length 0: none to cast), and the weight of
     the mirror image to `mirror` (n,) with its direction in `mirror_rays` (n, 3).
     """
     point, flat, normal = np.empty(3), np.empty(3), np.empty(3)
     here, there, view, toward, colour = (np.empty(3), np.empty(3), np.empty(3), np.empty(3),
                                          np.empty(3))
-    for i in range(first, last):
+    for i in range(rays.shape[0]):
         shadow_length[i] = 0.0
         mirror[i] = 0.0
         face = faces[i]
@@ -290,8 +319,7 @@ def shade(first: int, last: int, origins: Array, rays: Array, distance: Array, t
         if lamps.shape[0]:
             rest, near, reach = _lamplight(lamps, point, normal, toward)
         else:
-            for a in range(3):
-                toward[a] = light.sun[a]
+            _sunward(light, i % samples, samples, toward)
             near = light.sun_strength * (normal[0] * toward[0] + normal[1] * toward[1]
                                          + normal[2] * toward[2])
             near = max(near, -material.translucent * near)

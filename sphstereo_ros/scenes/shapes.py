@@ -146,6 +146,19 @@ def sills(holes: Sequence[Rectangle], reach: float = 0.12) -> Mesh:
                np.stack([x1 + 0.1, 0.05 * depth, z0], -1))
 
 
+def railing(x0: float, x1: float, reach: float, z: float) -> Mesh:
+    """A balcony's railing of thin bars, `reach` before the wall y = 0, standing on z."""
+    feet = [(x, -reach) for x in np.arange(x0, x1, 0.12)]
+    feet += [(x, -y) for x in (x0, x1) for y in np.arange(0.05, reach + 0.01, 0.12)]
+    low = np.array([(x - 0.008, y - 0.008, z) for x, y in feet])
+    bars = box(low, low + (0.016, 0.016, 0.95))
+    rails = box([(x0, -reach - 0.02, z + 0.95), (x0 - 0.02, -reach, z + 0.95),
+                 (x1 - 0.02, -reach, z + 0.95)],
+                [(x1, -reach + 0.02, z + 1.0), (x0 + 0.02, 0, z + 1.0),
+                 (x1 + 0.02, 0, z + 1.0)])
+    return joined([bars, rails])
+
+
 def gable_roof(length: float, depth: float, eaves: float, rise: float,
                overhang: float = 0.4) -> Mesh:
     """A saddle roof over [0, length] × [0, depth], its ridge along x."""
@@ -208,7 +221,7 @@ def tree(rng: np.random.Generator, height: float, crown: float, leaf: float,
                              thick * np.array([0.16, 0.1, 0.04]), sides=4))
             twigs += [twig, (bend + twig) / 2]
     pick = rng.integers(len(twigs), size=count)
-    spread = 0.16 * crown * rng.uniform(0.6, 1.5, (len(twigs), 1))
+    spread = 0.17 * crown * rng.uniform(0.5, 1.5, (len(twigs), 1))
     centres = np.array(twigs)[pick] + spread[pick] * rng.normal(size=(count, 3))
     return joined(wood), leaves(rng, centres[centres[:, 2] > 0.55 * fork], leaf)
 

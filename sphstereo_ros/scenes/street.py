@@ -37,7 +37,19 @@ def street(seed: int) -> Scene:
     _wires(build)
     build.add('end', shapes.box((_TO + 6, -30, 0), (_TO + 16, 30, 14)),
               surfaces.plain_plaster(rng))
+    hills(build)
     return Scene(build.parts(), daylight(rng))
+
+
+def hills(build: Builder) -> None:
+    """Wooded hills on the horizon."""
+    rng = build.rng
+    wood = surfaces.seeded(surfaces.FOREST, rng)
+    for turn in np.arange(0, 2 * np.pi, 0.45) + rng.uniform(0, 0.4):
+        hill = shapes.rounded(rng.uniform(120, 240), rng.uniform(120, 240),
+                              rng.uniform(16, 44), 1.0)
+        build.add('hill', shapes.moved(hill, 330 * np.cos(turn), 330 * np.sin(turn), -1), wood,
+                  True)
 
 
 def _ground(build: Builder) -> None:
@@ -63,6 +75,10 @@ def _ground(build: Builder) -> None:
     for x in np.arange(_FROM, _TO, 23.0) + rng.uniform(0, 20):
         disc = shapes.pole(x, float(rng.uniform(-2, 2)), 0.6, 0.004)
         build.add('manhole', disc, replace(cover, grain=0.5, grain_size=0.05))
+    patch = surfaces.seeded(surfaces.PATCH, rng)
+    for x in rng.uniform(_FROM, _TO, 16):
+        y, length, width = rng.uniform(-3.8, 2.4), rng.uniform(0.8, 5), rng.uniform(0.5, 1.4)
+        build.add('patch', shapes.sheet(x, x + length, y, y + width, 0.002), patch)
     for side in (1, -1):
         slabs = surfaces.seeded((surfaces.SLABS, surfaces.COBBLES, surfaces.SMOOTH_ASPHALT)[
             rng.integers(3)], rng)
@@ -99,7 +115,7 @@ def _garden(build: Builder, x: float, width: float, side: int) -> None:
     near, far = sorted((side * _PAVEMENT, side * (_PAVEMENT + 0.25)))
     build.add('garden wall', shapes.box((x, near, 0), (x + width, far, 2.0)),
               surfaces.plain_plaster(rng))
-    build.tree(x + width / 2, side * (_PAVEMENT + 4), float(rng.uniform(6, 9)), 2.6, 0.13, 4500,
+    build.tree(x + width / 2, side * (_PAVEMENT + 4), float(rng.uniform(6, 9)), 2.6, 0.16, 5000,
                surfaces.foliage(rng))
 
 
@@ -111,9 +127,9 @@ def _furniture(build: Builder, side: int) -> None:
     for k, x in enumerate(np.arange(start, _TO, 11.5) + rng.uniform(-1.5, 1.5)):
         if rng.random() < 0.25:
             continue
-        leaf, count, kind = ((0.075, 7000, small), (0.14, 3200, large))[k % 2]
+        leaf, count, kind = ((0.085, 13000, small), (0.15, 5500, large))[k % 2]
         if abs(x - 15) > 45:
-            leaf, count = 1.6 * leaf, count // 3
+            leaf, count = 1.8 * leaf, count // 3
         build.tree(float(x), y + side * 0.3, float(rng.uniform(5.5, 8.5)),
                    float(rng.uniform(1.6, 2.4)), leaf, count, kind)
     for x in np.arange(start + 5, _TO, 24.0):
@@ -125,7 +141,7 @@ def _furniture(build: Builder, side: int) -> None:
             build.add('bollard', shapes.pole(float(x), y - side * 0.25, 0.08, 0.9, _HEIGHT),
                       surfaces.DARK_METAL, True)
     for x in rng.uniform(_FROM, _TO, 14):
-        low = (float(x), side * (_PAVEMENT - 0.75), _HEIGHT)
+        low = (float(x), side * (_PAVEMENT - 0.5) - 0.3, _HEIGHT)
         build.add('bin', shapes.box(low, np.add(low, (0.6, 0.6, 1.0))), surfaces.RUBBER)
 
 

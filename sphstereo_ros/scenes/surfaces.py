@@ -8,9 +8,11 @@ import numpy as np
 from .material import Colour, Material
 
 ASPHALT = Material(colour=(0.105, 0.105, 0.11), stain_colour=(0.075, 0.075, 0.08), stain=0.8,
-                   stain_size=3.0, grain=0.16, grain_size=0.04, grain_gain=0.9, specular=0.02,
-                   exponent=12.0)
-SMOOTH_ASPHALT = replace(ASPHALT, stain=0.35, grain=0.03, stain_size=6.0, specular=0.03)
+                   stain_size=3.0, grain=0.2, grain_size=0.025, grain_gain=1.0, crack=0.012,
+                   crack_size=2.0, specular=0.02, exponent=12.0)
+SMOOTH_ASPHALT = replace(ASPHALT, stain=0.35, grain=0.035, stain_size=6.0, crack=0.0,
+                         specular=0.03)
+PATCH = replace(ASPHALT, colour=(0.07, 0.07, 0.072), grain=0.1)
 PAINT = Material(colour=(0.62, 0.62, 0.6), stain_colour=(0.25, 0.25, 0.25), stain=0.8,
                  stain_size=0.25, grain=0.15, grain_size=0.03)
 SLABS = Material(colour=(0.33, 0.32, 0.30), stain_colour=(0.22, 0.21, 0.20), stain=0.6,
@@ -21,6 +23,8 @@ CONCRETE = Material(colour=(0.36, 0.355, 0.34), stain_colour=(0.26, 0.26, 0.25),
                     stain_size=1.5, grain=0.05, grain_size=0.1)
 GRASS = Material(colour=(0.10, 0.16, 0.045), stain_colour=(0.16, 0.15, 0.06), stain=0.9,
                  stain_size=1.5, grain=0.4, grain_size=0.12, grain_gain=0.85)
+FOREST = Material(colour=(0.06, 0.09, 0.05), stain_colour=(0.1, 0.11, 0.08), stain=0.8,
+                  stain_size=25.0, grain=0.5, grain_size=5.0, grain_gain=0.8)
 EARTH = Material(colour=(0.17, 0.13, 0.09), stain_colour=(0.25, 0.2, 0.15), stain=0.8,
                  stain_size=0.8, grain=0.3, grain_size=0.15, grain_gain=0.75)
 BARK = Material(colour=(0.16, 0.12, 0.09), stain_colour=(0.24, 0.22, 0.18), stain=0.7,
@@ -78,7 +82,7 @@ def old_plaster(rng: np.random.Generator) -> Material:
     colour = _pick(rng, _PLASTERS)
     return seeded(Material(colour=colour, stain_colour=_darker(colour, 0.6), stain=0.9,
                            stain_size=1.6, grain=0.09, grain_size=0.2, grain_gain=0.7,
-                           stretch=(1.0, 1.0, 1.8), dirt=0.5), rng)
+                           stretch=(1.0, 1.0, 1.8), crack=0.006, crack_size=1.2, dirt=0.5), rng)
 
 
 def brick(rng: np.random.Generator) -> Material:
