@@ -31,7 +31,7 @@ def aligned_correspondences(reference: Image8, current: Image8, pose: RelativePo
     ref, cur, axes = aligned_pair(reference, current, pose, grid)
     inside = np.zeros(grid.shape, bool)
     inside[grid.wrap:-grid.wrap, np.sin(grid.theta()) > np.sin(_POLE)] = True
-    points = features(cur, spacing_for(count, grid.height), inside)
+    points, sigma = features(cur, spacing_for(count, grid.height), inside)
     moved, found = follow(cur, ref, points)
     offset = np.array([grid.margin, grid.wrap]) - 0.5
 
@@ -39,7 +39,8 @@ def aligned_correspondences(reference: Image8, current: Image8, pose: RelativePo
         theta, azimuth = ((pixels[found] - offset) * grid.pixel).T
         return polar_bearings(theta, azimuth, axes)
 
-    return Correspondences(bearings(moved) @ pose.rotation, bearings(points))
+    return Correspondences(bearings(moved) @ pose.rotation, bearings(points),
+                           sigma[found] * grid.pixel)
 
 
 class Aligner:

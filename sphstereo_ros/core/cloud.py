@@ -25,10 +25,10 @@ def default_stride(height: int) -> int:
 
 @lru_cache(maxsize=4)
 def _bearings(height: int, stride: int, camera: CameraConfig) -> NDArray[np.float32]:
-    """Bearings of every stride-th pixel in base_link, (rows, columns, 3)."""
+    """Bearings (N, 3) of every stride-th pixel and row in base_link."""
     v, u = np.mgrid[0:height:stride, 0:2 * height:stride]
     optical = Equirectangular(height, 2 * height).unproject(np.stack([u, v], -1).astype(float))
-    return (optical @ mount(camera).rotation.T).astype(np.float32)
+    return (optical @ mount(camera).rotation.T).astype(np.float32).reshape(-1, 3)
 
 
 def point_cloud(range_image: RangeImage, frame: Frame, config: Config) -> PointCloud:
@@ -38,12 +38,14 @@ def point_cloud(range_image: RangeImage, frame: Frame, config: Config) -> PointC
     """
     height = range_image.range.shape[0]
     stride = config.points.stride or default_stride(height)
-    r = range_image.range[::stride, ::stride]
-    known = np.isfinite(r)
-    bearings = _bearings(height, stride, config.camera)
-    xyz = bearings[known] * r[known][:, None] + mount(config.camera).position.astype(np.float32)
-    sigma = range_image.sigma[::stride, ::stride][known]
+    thin = (slice(None, None, stride), slice(None, None, stride))
+    r = range_image.range[thin].ravel()
+    known = np.flatnonzero(np.isfinite(r))
+    xyz = _bearings(height, stride, config.camera)[known]
+    xyz *= r[known, None]
+    xyz += mount(config.camera).position.astype(np.float32)
+    sigma = range_image.sigma[thin].ravel()[known]
     if config.points.colour and frame.colour is not None:
-        bgr = frame.colour[::stride, ::stride][known]
+        bgr = frame.colour[thin].reshape(-1, 3)[known]
         return PointCloud(range_image.key, xyz, sigma, bgr=bgr)
-    return PointCloud(range_image.key, xyz, sigma, frame.image[::stride, ::stride][known])
+    return PointCloud(range_image.key, xyz, sigma, frame.image[thin].ravel()[known])

@@ -31,6 +31,10 @@ def _collector() -> Floats:
 
 _COLLECT = _collector()
 
+# The null space that an SVD gives can have axes along which the true E has no weight (sideways
+# motion without rotation): turned by this, it has none that a motion would be likely to meet.
+_TURN = np.linalg.qr(np.vander([0.3, 0.7, 1.1, 1.9]))[0]
+
 
 def _constraints(basis: Floats) -> Floats:
     """Coefficients (N, 10, 20) of det E = 0 and 2EEᵀE − tr(EEᵀ)E = 0, for bases (N, 4, 3, 3)."""
@@ -60,7 +64,8 @@ def essential_matrices(reference: Floats, current: Floats) -> Floats:
     """
     n = len(reference)
     rows = np.einsum('nka,nkb->nkab', current, reference).reshape(n, 5, 9)
-    basis = np.linalg.svd(rows, full_matrices=True)[2][:, 5:].reshape(n, 4, 3, 3)
+    null_space = np.linalg.svd(rows, full_matrices=True)[2][:, 5:]
+    basis = (_TURN @ null_space).reshape(n, 4, 3, 3)
     m = _constraints(basis)
     good = np.linalg.cond(m[:, :, :10]) < 1e12
     basis, m = basis[good], m[good]

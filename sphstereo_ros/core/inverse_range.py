@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .config import RangeConfig
 from .frames import Image8, RelativePose
-from .jit import fast_kernel, rows_in_parallel
-from .matching import Parallax
+from .jit import fast_kernel, kernel, rows_in_parallel
+from .matching import UNKNOWN, Parallax
 from .warp import Map, PolarGrid, _arctan2
 
 Floats = NDArray[np.float64]
 
-_UNKNOWN = np.float32(-1e3)  # instead of NaN where the kernel may re-order arithmetic
 _CONFIDENT = 3.0  # standard deviations
 
 
@@ -47,48 +47,75 @@ def _grid_angles(height: int) -> tuple[Map, Map, Map, Map]:
 
 
 @fast_kernel
+def _polar_row(cos_lat: np.float32, sin_lat: np.float32, cos_lon: Map, sin_lon: Map, axes: Map,
+               first: np.float32, wrap: np.float32, per_pixel: np.float32,
+               out: Map) -> None:  # pragma: no cover - compiled
+    """Sine and cosine of θ, and column and row on the polar grid, of a row of pixels."""
+    turn = np.float32(2 * np.pi)
+    for j in range(cos_lon.size):
+        x, y, z = cos_lat * sin_lon[j], -sin_lat, cos_lat * cos_lon[j]
+        px = axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z
+        py = axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z
+        pz = axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z
+        sine = np.sqrt(px * px + py * py)
+        azimuth = _arctan2(py, px)
+        azimuth = azimuth + turn if azimuth < 0 else azimuth
+        out[0, j] = sine
+        out[1, j] = pz
+        out[2, j] = _arctan2(sine, pz) * per_pixel + first
+        out[3, j] = azimuth * per_pixel + wrap
+
+
+@fast_kernel
+def _sample(parallax: Map, column: Any, row: Any) -> Any:  # pragma: no cover - compiled
+    """Bilinear where the four neighbours agree to a pixel, else the nearest: edges stay sharp."""
+    c0, r0 = int(column), int(row)
+    fc, fr = column - c0, row - r0
+    a, b = parallax[r0, c0], parallax[r0, c0 + 1]
+    d, e = parallax[r0 + 1, c0], parallax[r0 + 1, c0 + 1]
+    if max(a, b, d, e) - min(a, b, d, e) < np.float32(1):
+        return (a * (1 - fc) + b * fc) * (1 - fr) + (d * (1 - fc) + e * fc) * fr
+    if fr < np.float32(0.5):
+        return a if fc < np.float32(0.5) else b
+    return d if fc < np.float32(0.5) else e
+
+
+@fast_kernel
 def _rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map, sin_lon: Map,
-          axes: Map, parallax: Map, sigma: Map, pixel: np.float32, margin: int, wrap: int,
-          noise: Map, rho_out: Map, sigma_out: Map) -> None:  # pragma: no cover - compiled
-    baseline, rotation_sigma, direction_sigma, baseline_sigma = noise
-    per_pixel = np.float32(1) / pixel
-    full_turn = np.float32(2 * np.pi)
+          axes: Map, parallax: Map, sigma: Map, pixel: np.float32, margin: np.float32,
+          wrap: np.float32, noise: Map, rho_out: Map,
+          sigma_out: Map) -> None:  # pragma: no cover - compiled
+    per_baseline = np.float32(1) / noise[0]
+    rotation_variance = noise[1] * noise[1]
+    direction_sigma, baseline_sigma = noise[2], noise[3]
+    at = np.empty((4, cos_lon.size), np.float32)
+    half, unknown = np.float32(0.5), np.float32(UNKNOWN)
     for i in range(first, last):
+        _polar_row(cos_lat[i], sin_lat[i], cos_lon, sin_lon, axes, margin - half, wrap - half,
+                   np.float32(1) / pixel, at)
         for j in range(cos_lon.size):
-            x, y, z = cos_lat[i] * sin_lon[j], -sin_lat[i], cos_lat[i] * cos_lon[j]
-            px = axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z
-            py = axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z
-            pz = axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z
-            theta = _arctan2(np.sqrt(px * px + py * py), pz)
-            azimuth = _arctan2(py, px)
-            azimuth = azimuth + full_turn if azimuth < 0 else azimuth
-            c = theta * per_pixel - np.float32(0.5) + margin
-            r = azimuth * per_pixel - np.float32(0.5) + wrap
-            c0, r0 = int(np.floor(c)), int(np.floor(r))
-            fc, fr = c - c0, r - r0
-            a, b = parallax[r0, c0], parallax[r0, c0 + 1]
-            d, e = parallax[r0 + 1, c0], parallax[r0 + 1, c0 + 1]
-            rn, cn = r0 + int(fr + np.float32(0.5)), c0 + int(fc + np.float32(0.5))
-            if max(a, b, d, e) - min(a, b, d, e) < np.float32(1):
-                n = (a * (1 - fc) + b * fc) * (1 - fr) + (d * (1 - fc) + e * fc) * fr
-            else:  # an edge, or something unknown: nothing is mixed
-                n = parallax[rn, cn]
+            n = _sample(parallax, at[2, j], at[3, j])
+            sine, cosine = at[0, j], at[1, j]
             delta = n * pixel
-            theta1 = theta - delta
-            if n < np.float32(-900) or theta1 <= 0 or theta1 >= np.float32(np.pi):
-                rho_out[i, j] = _UNKNOWN
-                sigma_out[i, j] = _UNKNOWN
+            d2 = delta * delta
+            # sin δ to 3e-8 up to 1 rad
+            sin_d = delta * (1 - d2 * np.float32(1 / 6) * (1 - d2 * np.float32(1 / 20) * (
+                1 - d2 * np.float32(1 / 42) * (1 - d2 * np.float32(1 / 72)))))
+            cos_d = np.sqrt(max(1 - sin_d * sin_d, np.float32(0)))
+            sin1 = sine * cos_d - cosine * sin_d  # θ1 = θ2 − δ
+            if n == unknown or abs(delta) > 1 or sin1 <= np.float32(1e-6):
+                rho_out[i, j] = np.nan
+                sigma_out[i, j] = np.nan
                 continue
-            s1 = np.sin(theta1)
-            rho = np.sin(delta) / (baseline * s1)
-            match = sigma[rn, cn] * pixel
-            by_delta = np.sqrt(px * px + py * py) / (baseline * s1 * s1)
-            from_match = by_delta * by_delta * (match * match + rotation_sigma * rotation_sigma)
-            from_direction = rho * np.cos(theta1) / s1 * direction_sigma
-            from_baseline = rho * baseline_sigma
+            per_sin1 = np.float32(1) / sin1
+            rho = sin_d * per_baseline * per_sin1
+            match = sigma[int(at[3, j] + half), int(at[2, j] + half)] * pixel
+            by_delta = sine * per_baseline * per_sin1 * per_sin1
+            by_direction = rho * (cosine * cos_d + sine * sin_d) * per_sin1 * direction_sigma
+            by_baseline = rho * baseline_sigma
             rho_out[i, j] = rho
-            sigma_out[i, j] = np.sqrt(from_match + from_direction * from_direction
-                                      + from_baseline * from_baseline)
+            sigma_out[i, j] = np.sqrt(by_delta * by_delta * (match * match + rotation_variance)
+                                      + by_direction * by_direction + by_baseline * by_baseline)
 
 
 def inverse_range(parallax: Parallax, grid: PolarGrid, axes: Floats, pose: RelativePose,
@@ -109,14 +136,10 @@ def inverse_range(parallax: Parallax, grid: PolarGrid, axes: Floats, pose: Relat
     rotation_sigma, direction_sigma, known_sigma = pose_sigmas(pose)
     noise = np.array([pose.baseline if pose.is_metric else 1.0, rotation_sigma, direction_sigma,
                       known_sigma or baseline_sigma], np.float32)
-    known = np.where(np.isfinite(parallax.pixels), parallax.pixels, _UNKNOWN)
     rho, sigma = (np.empty((height, 2 * height), np.float32) for _ in range(2))
+    pixel, margin, wrap = (np.float32(n) for n in (grid.pixel, grid.margin, grid.wrap))
     rows_in_parallel(_rows, height, *_grid_angles(height), np.ascontiguousarray(axes, np.float32),
-                     known, parallax.sigma, np.float32(grid.pixel), grid.margin, grid.wrap, noise,
-                     rho, sigma)
-    unknown = rho == _UNKNOWN
-    rho[unknown] = np.nan
-    sigma[unknown] = np.nan
+                     parallax.pixels, parallax.sigma, pixel, margin, wrap, noise, rho, sigma)
     return InverseRange(rho, sigma, parallax.signed)
 
 
@@ -152,6 +175,26 @@ def fuse(estimates: list[InverseRange]) -> InverseRange:
     return InverseRange(rho, sigma, signed)
 
 
+@kernel
+def _publish(first: int, last: int, rho: Map, sigma: Map, limits: Map, signed: bool, r_out: Map,
+             sigma_out: Map) -> None:  # pragma: no cover - compiled
+    nearest, farthest, max_relative, confident = limits
+    nothing = np.float32(np.nan)
+    for i in range(first, last):
+        for j in range(rho.shape[1]):
+            p, s = rho[i, j], sigma[i, j]
+            r, spread = nothing, nothing
+            if signed and p + confident * s < farthest and p > -confident * s:
+                r = np.float32(np.inf)
+            elif p > 0 and s <= max_relative * p:
+                if p > nearest:
+                    r = np.float32(-np.inf)
+                elif p >= farthest:
+                    r, spread = 1 / p, s / (p * p)
+            r_out[i, j] = r
+            sigma_out[i, j] = spread
+
+
 def published_range(estimate: InverseRange, limits: RangeConfig, is_metric: bool,
                     mask: Image8 | None = None) -> tuple[Map, Map]:
     """Range and sigma as they are published (REP-117), float32 (H, 2H).
@@ -160,18 +203,13 @@ def published_range(estimate: InverseRange, limits: RangeConfig, is_metric: bool
     nearer than `range.min`. +Inf: at least three standard deviations beyond `range.max`. Without
     metric scale the limits in metres do not apply.
     """
-    rho, sigma = estimate.rho, estimate.sigma
-    with np.errstate(divide='ignore', invalid='ignore'):
-        r = np.asarray(1 / rho, np.float32)
-        relative = sigma * r
-        good = (relative > 0) & (relative <= limits.max_relative_sigma)
-        r[~good] = np.nan
-        if is_metric:
-            beyond = (rho + _CONFIDENT * sigma < 1 / limits.maximum) & (rho > -_CONFIDENT * sigma)
-            if estimate.signed:
-                r[beyond] = np.inf
-            r[(r > limits.maximum) & np.isfinite(r)] = np.nan
-            r[r < limits.minimum] = -np.inf
+    r, sigma = np.empty_like(estimate.rho), np.empty_like(estimate.rho)
+    nearest = 1 / max(limits.minimum, 1e-9) if is_metric else np.inf
+    farthest = 1 / limits.maximum if is_metric else 0.0
+    bounds = np.array([nearest, farthest, limits.max_relative_sigma, _CONFIDENT], np.float32)
+    rows_in_parallel(_publish, r.shape[0], estimate.rho, estimate.sigma, bounds,
+                     estimate.signed and is_metric, r, sigma)
     if mask is not None:
         r[mask != 0] = np.nan
-    return r, np.where(np.isfinite(r), relative * r, np.float32(np.nan)).astype(np.float32)
+        sigma[mask != 0] = np.nan
+    return r, sigma

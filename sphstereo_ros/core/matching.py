@@ -2,7 +2,7 @@
 
 A matcher takes both views on one polar grid (rows are meridians) and gives the parallax of the
 current view in pixels along θ, δ = θ_current − θ_reference, with its standard deviation. What it
-does not know is NaN.
+does not know is UNKNOWN: no NaN, so that compiled code may re-order arithmetic.
 """
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 
 from .config import StereoConfig
 from .frames import Image8
+from .jit import kernel, rows_in_parallel
 
 Pixels = NDArray[np.float32]
+
+UNKNOWN = -1000.0
 
 
 @dataclass(frozen=True)
 class Parallax:
-    """Parallax on a polar grid: `pixels` and `sigma`, float32 of the grid's shape; NaN unknown.
+    """Parallax on a polar grid: `pixels` (or UNKNOWN) and `sigma`, float32 of the grid's shape.
 
     A matcher whose search ends at zero cannot say that a point is beyond all range: `signed` tells
     that parallaxes about zero were searched on both sides.
@@ -55,7 +58,7 @@ def structure(image: Image8, window: int = 9) -> Pixels:
 
 def gradient_sigma(image: Image8) -> Pixels:
     """Standard deviation of a match in px from the image's structure alone."""
-    return np.asarray(_NOISE / (structure(image) + np.float32(0.3)) * 0.3 + _FLOOR, np.float32)
+    return _FLOOR + np.float32(0.3 * _NOISE) / (structure(image) + np.float32(0.3))
 
 
 def inverse_search(preset: str, finest_scale: int) -> Any:
@@ -85,8 +88,9 @@ def flow_matcher(preset: str, finest_scale: int) -> Matcher:
         loop = _forth_and_back(there, back)
         along, across = there[..., 0], there[..., 1]
         sigma = cv2.magnitude(gradient_sigma(current), _FORTH_AND_BACK * loop)
-        wrong = (loop > 1) | (np.abs(across) > 1)
-        return Parallax(np.where(wrong, np.float32(np.nan), -along), sigma, signed=True)
+        pixels = -along
+        pixels[(loop > 1) | (np.abs(across) > 1)] = UNKNOWN
+        return Parallax(pixels, sigma, signed=True)
 
     return match
 
@@ -102,6 +106,16 @@ def _forth_and_back(there: Pixels, back: Pixels) -> Pixels:
                                     np.ascontiguousarray(loop[..., 1])))
 
 
+@kernel
+def _from_fixed_point(first: int, last: int, disparity: NDArray[np.int16],
+                      pixels: Pixels) -> None:  # pragma: no cover - compiled
+    """Sixteenths to pixels; what is not positive was not found."""
+    for i in range(first, last):
+        for j in range(pixels.shape[1]):
+            d = disparity[i, j]
+            pixels[i, j] = d * np.float32(0.0625) if d > 0 else np.float32(UNKNOWN)
+
+
 def _opencv_matcher(stereo: Any, disparities: int, block: int) -> Matcher:
     """A StereoBM or StereoSGBM, padded: it leaves the first columns and the rim empty."""
     left, rim = disparities + block // 2, block // 2
@@ -110,7 +124,8 @@ def _opencv_matcher(stereo: Any, disparities: int, block: int) -> Matcher:
         padded = [cv2.copyMakeBorder(im, rim, rim, left, rim, cv2.BORDER_REPLICATE)
                   for im in (current, reference)]
         disparity = stereo.compute(*padded)[rim:-rim, left:-rim]
-        pixels = np.where(disparity > 0, disparity * np.float32(1 / 16), np.float32(np.nan))
+        pixels = np.empty(current.shape, np.float32)
+        rows_in_parallel(_from_fixed_point, len(pixels), disparity, pixels)
         return Parallax(pixels, gradient_sigma(current), signed=False)
 
     return match

@@ -5,6 +5,7 @@ side count alike. Convention: X_cur = R X_ref + p; from correspondences |p| = 1.
 """
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,22 +13,26 @@ from numpy.typing import NDArray
 
 from . import rotations
 from .five_point import decompose, essential_matrices
+from .jit import kernel
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Correspondences:
-    """The same points seen from two views: unit bearings (N, 3), each in its view's frame."""
+    """The same points seen from two views: unit bearings (N, 3), each in its view's frame, and the
+    expected standard deviation (N,) of each match, rad (only their ratios matter).
+    """
 
     reference: Floats
     current: Floats
+    sigma: Floats
 
     def __len__(self) -> int:
         return len(self.reference)
 
     def __getitem__(self, index: NDArray[np.bool_] | NDArray[np.intp]) -> Correspondences:
-        return Correspondences(self.reference[index], self.current[index])
+        return Correspondences(self.reference[index], self.current[index], self.sigma[index])
 
 
 @dataclass(frozen=True)
@@ -83,10 +88,10 @@ def in_front(rotation: Floats, direction: Floats, points: Correspondences) -> ND
 
 
 def _best_model(models: Floats, points: Correspondences, threshold: float) -> tuple[Floats, float]:
-    normal = np.einsum('mab,nb->mna', models, points.reference)
-    length = np.maximum(np.linalg.norm(normal, axis=2), 1e-9)
-    residual = np.einsum('mna,na->mn', normal, points.current) / length
-    cost = np.minimum((residual / threshold)**2, 1.0).mean(axis=1)  # MSAC
+    normal = models @ points.reference.T  # (M, 3, N)
+    squared = (normal * points.current.T).sum(axis=1)**2 / np.maximum(
+        (normal * normal).sum(axis=1), 1e-18)
+    cost = np.minimum(squared / threshold**2, 1.0).mean(axis=1)  # MSAC
     best = int(np.argmin(cost))
     return models[best], float(cost[best])
 
@@ -126,21 +131,35 @@ def ransac(points: Correspondences, threshold: float, rng: np.random.Generator, 
     return max(poses, key=lambda pose: int(in_front(pose[0], pose[1], support).sum()))
 
 
-def _jacobian(rotation: Floats, direction: Floats, points: Correspondences,
-              basis: Floats) -> tuple[Floats, Floats]:
-    """Residuals (N,) and their derivatives (N, 5) by a left small rotation and the direction."""
-    turned = points.reference @ rotation.T
-    normal = np.cross(direction, turned)
-    length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
-    normal = normal / length
-    residual = np.einsum('na,na->n', points.current, normal)
-    h = (points.current - residual[:, None] * normal) / length
-    return residual, np.concatenate([np.cross(turned, np.cross(h, direction)),
-                                     np.cross(turned, h) @ basis], axis=1)
+@kernel
+def _residuals(rotation: Floats, direction: Floats, reference: Floats, current: Floats,
+               out: Floats, jacobian: Floats) -> None:  # pragma: no cover - compiled
+    """Residuals (N,), and derivatives (N, 6) by a left small rotation and by the direction.
+
+    With g = R f1, n = p × g: residual f2·n/|n|; h = (f2 − residual n/|n|)/|n| gives
+    g × (h × p) for the rotation and g × h for the direction.
+    """
+    for k in range(len(reference)):
+        f1x, f1y, f1z = reference[k]
+        f2x, f2y, f2z = current[k]
+        px, py, pz = direction
+        gx = rotation[0, 0] * f1x + rotation[0, 1] * f1y + rotation[0, 2] * f1z
+        gy = rotation[1, 0] * f1x + rotation[1, 1] * f1y + rotation[1, 2] * f1z
+        gz = rotation[2, 0] * f1x + rotation[2, 1] * f1y + rotation[2, 2] * f1z
+        nx, ny, nz = py * gz - pz * gy, pz * gx - px * gz, px * gy - py * gx
+        length = max(math.sqrt(nx * nx + ny * ny + nz * nz), 1e-9)
+        nx, ny, nz = nx / length, ny / length, nz / length
+        r = f2x * nx + f2y * ny + f2z * nz
+        hx, hy, hz = (f2x - r * nx) / length, (f2y - r * ny) / length, (f2z - r * nz) / length
+        kx, ky, kz = hy * pz - hz * py, hz * px - hx * pz, hx * py - hy * px
+        out[k] = r
+        jacobian[k, 0], jacobian[k, 3] = gy * kz - gz * ky, gy * hz - gz * hy
+        jacobian[k, 1], jacobian[k, 4] = gz * kx - gx * kz, gz * hx - gx * hz
+        jacobian[k, 2], jacobian[k, 5] = gx * ky - gy * kx, gx * hy - gy * hx
 
 
 def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iterations: int = 8,
-           weights: Floats | None = None, floor: float = 2e-5) -> PoseEstimate | None:
+           floor: float = 0.2) -> PoseEstimate | None:
     """Minimise the angular residuals with Tukey weights (Gauss–Newton on SO(3) × S²).
 
     Parameters
@@ -148,29 +167,35 @@ def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iter
     rotation, direction : the start
     points : correspondences, outliers among them
     iterations : at most
-    weights : (N,) of each correspondence beforehand, default 1
-    floor : least standard deviation taken for the residuals, rad
+    floor : least scale of the residuals taken, as a share of the expected ones
 
     Returns
     -------
     None where the correspondences do not fix five parameters.
 
     """
-    prior = np.ones(len(points)) if weights is None else weights
-    scale, w = floor, prior
-    for _ in range(iterations):
+    expected = points.sigma
+    scale, w = floor, expected
+    residual, derivatives = np.empty(len(points)), np.empty((len(points), 6))
+    for iteration in range(iterations):
         basis = tangent(direction)
-        residual, jacobian = _jacobian(rotation, direction, points, basis)
-        scale = max(1.4826 * float(np.median(np.abs(residual))), floor)
-        w = prior * np.clip(1 - (residual / (4.685 * scale))**2, 0, None)**2
-        normal = (jacobian * w[:, None]).T @ jacobian
+        _residuals(rotation, direction, points.reference, points.current, residual, derivatives)
+        jacobian = np.concatenate([derivatives[:, :3], derivatives[:, 3:] @ basis], axis=1)
+        normalised = residual / expected
+        scale = max(1.4826 * float(np.median(np.abs(normalised))), floor)
+        # Near points fix the direction, and a wrong start moves them most: first a wide loss.
+        width = 4.685 * scale * max(8 * 0.5**iteration, 1)
+        w = (np.clip(1 - (normalised / width)**2, 0, None) / expected)**2
+        weighted = jacobian * w[:, None]
+        normal = weighted.T @ jacobian
         if not np.isfinite(normal).all() or np.linalg.cond(normal) > 1e10:
             return None
-        step = -np.linalg.solve(normal, (jacobian * w[:, None]).T @ residual)
+        step = -np.linalg.solve(normal, weighted.T @ residual)
         rotation = rotations.exp(step[:3]) @ rotation
         direction = direction + basis @ step[3:]
         direction = direction / np.linalg.norm(direction)
-        if np.abs(step).max() < 1e-8:
+        if width <= 4.685 * scale and np.abs(step).max() < 1e-8:
             break
     covariance = np.asarray(np.linalg.inv(normal) * scale**2, np.float64)
-    return PoseEstimate(rotation, direction, w > 0, covariance, scale)
+    spread = scale * float(np.median(expected))
+    return PoseEstimate(rotation, direction, w > 0, covariance, spread)

@@ -15,12 +15,20 @@ from .warp import resample, rotation_map, with_border
 Floats = NDArray[np.float64]
 Points = NDArray[np.floating]
 
+# What the structure of a feature says of the error with which it is followed: OpenCV's eigenvalue
+# in squared grey levels per full-size pixel, the image's noise over a window of 11 pixels, the
+# floor that better structure does not lower, and the worst that is worth following (px).
+_BLOCK = 5
+_GREY_SQUARED = (4 * 255 * _BLOCK / 8 / _BLOCK)**2 / 4
+_NOISE, _FLOOR, _WORST = 1.5 / 11, 0.05, 0.5
+
 _WRAP = 48  # columns that wrap round on each side, so that tracks cross the seam
 _POLE = 0.2  # rad round zenith and nadir where an equirectangular image is too stretched to track
 
 
-def features(image: Image8, spacing: int, usable: NDArray[np.bool_] | None = None) -> Points:
-    """The pixel with the most structure in each neighbourhood of about `spacing` pixels.
+def features(image: Image8, spacing: int,
+             usable: NDArray[np.bool_] | None = None) -> tuple[Points, Floats]:
+    """The pixel with the most structure in each cell of `spacing` × `spacing` pixels.
 
     Structure is the lesser eigenvalue of the gradient's second moments, taken at half size: which
     pixel is chosen need not be exact.
@@ -33,19 +41,25 @@ def features(image: Image8, spacing: int, usable: NDArray[np.bool_] | None = Non
 
     Returns
     -------
-    (N, 2) float32 positions as (u, v)
+    (N, 2) float32 positions as (u, v), and (N,) the standard deviation in px with which each is
+    expected to be followed
 
     """
     half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    strength = cv2.cornerMinEigenVal(half, 5)
-    width = max(3, spacing // 2 | 1)
-    best = cv2.dilate(strength, np.ones((width, width), np.uint8))
-    chosen = (strength == best) & (strength > max(0.3 * float(np.median(strength)), 1e-6))
-    rows, columns = np.nonzero(chosen)
-    points = np.stack([2 * columns, 2 * rows], axis=1)
+    strength = cv2.cornerMinEigenVal(half, _BLOCK)
+    cell = max(2, spacing // 2)
+    rows, columns = (n // cell for n in strength.shape)
+    cells = strength[:rows * cell, :columns * cell].reshape(rows, cell, columns, cell)
+    cells = np.ascontiguousarray(cells.swapaxes(1, 2)).reshape(rows, columns, cell * cell)
+    best = cells.argmax(axis=2)
+    v = 2 * (np.arange(rows)[:, None] * cell + best // cell)
+    u = 2 * (np.arange(columns)[None] * cell + best % cell)
+    found = cells.max(axis=2)
+    sigma = np.sqrt(_FLOOR**2 + _NOISE**2 / np.maximum(found * _GREY_SQUARED, 1e-9))
+    keep = sigma < _WORST
     if usable is not None:
-        points = points[usable[points[:, 1], points[:, 0]]]
-    return points.astype(np.float32)
+        keep &= usable[v, u]
+    return np.stack([u[keep], v[keep]], axis=1).astype(np.float32), sigma[keep].astype(float)
 
 
 def follow(source: Image8, target: Image8, points: Points, *, window: int = 11,
@@ -86,11 +100,11 @@ def track(reference: Image8, current: Image8, rotation: Floats, count: int,
     usable = np.zeros(wrapped[0].shape, bool)
     cap = round(_POLE / np.pi * height)
     usable[cap:height - cap, _WRAP:-_WRAP] = True if mask is None else mask[cap:height - cap] == 0
-    points = features(wrapped[0], spacing_for(count, height), usable)
+    points, sigma = features(wrapped[0], spacing_for(count, height), usable)
     moved, found = follow(wrapped[0], wrapped[1], points, levels=4)
     found &= np.abs(moved[:, 1] - height / 2) < height / 2 - 1
     camera = Equirectangular(height, width)
     offset = np.array([_WRAP, 0.0])
     before, now = (np.asarray(camera.unproject(p[found] - offset), np.float64)
                    for p in (moved, points))
-    return Correspondences(before @ rotation, now)
+    return Correspondences(before @ rotation, now, sigma[found] * np.pi / height)
