@@ -16,7 +16,14 @@ from .frames import (
     RelativePose,
     StabilisedWindow,
 )
-from .relative_pose import Correspondences, PoseEstimate, parallax, ransac, refine
+from .relative_pose import (
+    Correspondences,
+    PoseEstimate,
+    epipolar_residuals,
+    parallax,
+    ransac,
+    refine,
+)
 from .tracking import track
 
 
@@ -38,7 +45,9 @@ def estimate(points: Correspondences, config: PoseConfig) -> PoseEstimate | Drop
     pose = refine(*found, points) if found else None
     if pose is None:
         return Drop('too_few_inliers', 'no pose fits the correspondences')
-    inliers = int(pose.inliers.sum())
+    # The robust loss adapts its width to the residuals, so inliers are counted by the threshold.
+    residual = np.abs(epipolar_residuals(pose.rotation, pose.direction, points))
+    inliers = int((pose.inliers & (residual < config.inlier_threshold)).sum())
     if inliers < max(config.min_inliers, config.min_inlier_ratio * len(points)):
         return Drop('too_few_inliers', f'{inliers} of {len(points)}')
     moved = float(np.median(parallax(pose.rotation, points[pose.inliers])))
