@@ -77,6 +77,12 @@ def parallax(rotation: Floats, points: Correspondences) -> Floats:
                                  np.einsum('na,na->n', turned, points.current)))
 
 
+def rotation_between(points: Correspondences) -> Floats:
+    """Rotation (3, 3) that brings the reference bearings nearest to the current ones."""
+    u, _, vt = np.linalg.svd(points.current.T @ points.reference)
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+
 def in_front(rotation: Floats, direction: Floats, points: Correspondences) -> NDArray[np.bool_]:
     """Which points lie on the positive side of both bearings, when triangulated, (N,) bool."""
     turned = points.reference @ rotation.T
@@ -97,7 +103,7 @@ def _best_model(models: Floats, points: Correspondences, threshold: float) -> tu
 
 
 def ransac(points: Correspondences, threshold: float, rng: np.random.Generator, *,
-           batch: int = 48, max_batches: int = 12, scored: int = 600,
+           batch: int = 24, max_batches: int = 24, scored: int = 600,
            confidence: float = 0.999) -> tuple[Floats, Floats] | None:
     """Rotation (3, 3) and direction (3,) with the most support, or None where nothing fits.
 

@@ -23,6 +23,7 @@ from .relative_pose import (
     parallax,
     ransac,
     refine,
+    rotation_between,
 )
 from .tracking import track
 
@@ -44,6 +45,8 @@ def estimate(points: Correspondences, config: PoseConfig) -> PoseEstimate | Drop
     found = ransac(points, config.inlier_threshold, np.random.default_rng(config.seed))
     pose = refine(*found, points) if found else None
     if pose is None:
+        if np.median(parallax(rotation_between(points), points)) < config.min_parallax:
+            return Drop('no_parallax', 'a rotation explains all correspondences')
         return Drop('too_few_inliers', 'no pose fits the correspondences')
     # The robust loss adapts its width to the residuals, so inliers are counted by the threshold.
     residual = np.abs(epipolar_residuals(pose.rotation, pose.direction, points))
