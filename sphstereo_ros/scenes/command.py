@@ -12,7 +12,7 @@ from .sequence import NO_NOISE, NOISE, SCENES, TUNING_SEEDS, render_sequence, sa
 # The sample bag's content: a scene that is neither tuned on nor reported.
 SAMPLE_SEED = 42
 SAMPLE_FRAMES = 20
-SAMPLE_QUALITY = 88
+SAMPLE_QUALITY = 92
 SAMPLE_RANGE_HEIGHT = 240
 
 

@@ -16,9 +16,9 @@ Colour = tuple[float, float, float]
 class Material:
     """A surface. Colours are linear RGB reflectances, sizes in metres.
 
-    The layers, in this order: `colour` stained towards `stain_colour` by soft noise; grain (noise
-    in octaves from `grain_size` down to `grain_fine`); cracks; blocks (bricks, slabs, tiles) with joints;
-    a different brightness for each face (leaves); dirt near the object's z = 0. Then the gloss:
+    The layers: `colour` stained towards `stain_colour` by soft noise; grain (noise in octaves
+    from `grain_size` down to `grain_fine`); a different brightness for each face (leaves); dirt
+    near the object's z = 0; cracks; blocks (bricks, slabs, tiles) with joints. Then the gloss:
     a Blinn highlight of the lights, and a mirror image of the scene weighted by Fresnel's law.
     """
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -125,6 +126,7 @@ class RenderedSequence(Sequence[TruthFrame]):
                       self.trajectory.positions[index], height or self.height)
 
 
+@lru_cache(maxsize=1)
 def _build(name: str, seed: int) -> Any:
     # Imported late: reading a folder needs no ray caster.
     from .corridor import corridor
@@ -148,7 +150,7 @@ def _path(name: str, rng: np.random.Generator, frames: int,
                  heading=float(rng.normal(0, 0.01)))
 
 
-_GAIN = {'street': 1.0, 'takeoff': 1.0, 'corridor': 1.0}
+_GAIN = {'street': 1.0, 'takeoff': 0.8, 'corridor': 1.6}
 
 
 def render_sequence(name: str, seed: int, frames: int, height: int = 960,

@@ -136,7 +136,8 @@ def _crack(material: Any, x: float, y: float, z: float, footprint: float) -> flo
     level = octaves(x, y, z, size, 0.06 * size, 0.5, 1e-3, material.seed + 37)
     beside = 0.3 * size * abs(level)  # about the distance in metres
     cover = min(1.0, max(0.0, (0.5 * material.crack - beside) / footprint + 0.5))
-    return 0.7 * cover * min(1.0, material.crack / footprint)
+    depth: float = 0.7 * cover * min(1.0, material.crack / footprint)
+    return depth
 
 
 @fast_kernel
@@ -279,9 +280,10 @@ def shade(samples: int, origins: Array, rays: Array, distance: Array, travelled:
           mirror: Array, mirror_rays: Array) -> None:
     """Shade the hits of `rays` (n, 3).
 
-    `samples` consecutive rays belong to one pixel. Writes radiance that needs no more rays to `base` (n, 3), what the shadow ray decides over to
-    `direct` (n, 3) with the ray itself in `shadow_*` (length 0: none to cast), and the weight of
-    the mirror image to `mirror` (n,) with its direction in `mirror_rays` (n, 3).
+    `samples` consecutive rays belong to one pixel. Writes radiance that needs no more rays to
+    `base` (n, 3), what the shadow ray decides over to `direct` (n, 3) with the ray itself in
+    `shadow_*` (length 0: none to cast), and the weight of the mirror image to `mirror` (n,) with
+    its direction in `mirror_rays` (n, 3).
     """
     point, flat, normal = np.empty(3), np.empty(3), np.empty(3)
     here, there, view, toward, colour = (np.empty(3), np.empty(3), np.empty(3), np.empty(3),
@@ -325,14 +327,16 @@ def shade(samples: int, origins: Array, rays: Array, distance: Array, travelled:
             near = max(near, -material.translucent * near)
         shine = 0.0
         if material.specular > 0 and near > 0:
-            shine = _highlight(ray, normal, toward, material) * (
-                near if lamps.shape[0] else light.sun_strength)
+            if lamps.shape[0] == 0:
+                shine = light.sun_strength * _highlight(ray, normal, toward, material)
+            elif material.mirror == 0:  # a mirror shows the lamps themselves
+                shine = near * _highlight(ray, normal, toward, material)
         for c in range(3):
             ambient = up * light.from_above[c] + (1 - up) * light.from_below[c]
             base[i, c] = colour[c] * (ambient + rest * light.sun_colour[c] + material.emission)
             direct[i, c] = (colour[c] * near + shine) * light.sun_colour[c]
         if near > 0:
-            shadow_length[i] = reach - 0.3 if lamps.shape[0] else reach
+            shadow_length[i] = max(reach - 0.3, 1e-3) if lamps.shape[0] else reach
             side = 1.0 if (flat[0] * toward[0] + flat[1] * toward[1]
                            + flat[2] * toward[2]) > 0 else -1.0
             for a in range(3):

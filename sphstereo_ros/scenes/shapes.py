@@ -151,7 +151,7 @@ def railing(x0: float, x1: float, reach: float, z: float) -> Mesh:
     feet = [(x, -reach) for x in np.arange(x0, x1, 0.12)]
     feet += [(x, -y) for x in (x0, x1) for y in np.arange(0.05, reach + 0.01, 0.12)]
     low = np.array([(x - 0.008, y - 0.008, z) for x, y in feet])
-    bars = box(low, low + (0.016, 0.016, 0.95))
+    bars = box(low, np.add(low, (0.016, 0.016, 0.95)))
     rails = box([(x0, -reach - 0.02, z + 0.95), (x0 - 0.02, -reach, z + 0.95),
                  (x1 - 0.02, -reach, z + 0.95)],
                 [(x1, -reach + 0.02, z + 1.0), (x0 + 0.02, 0, z + 1.0),

@@ -8,15 +8,15 @@ import numpy as np
 from .material import Colour, Material
 
 ASPHALT = Material(colour=(0.105, 0.105, 0.11), stain_colour=(0.075, 0.075, 0.08), stain=0.8,
-                   stain_size=3.0, grain=0.2, grain_size=0.025, grain_gain=1.0, crack=0.012,
+                   stain_size=3.0, grain=0.15, grain_size=0.025, grain_gain=1.0, crack=0.012,
                    crack_size=2.0, specular=0.02, exponent=12.0)
 SMOOTH_ASPHALT = replace(ASPHALT, stain=0.35, grain=0.035, stain_size=6.0, crack=0.0,
                          specular=0.03)
 PATCH = replace(ASPHALT, colour=(0.07, 0.07, 0.072), grain=0.1)
 PAINT = Material(colour=(0.62, 0.62, 0.6), stain_colour=(0.25, 0.25, 0.25), stain=0.8,
                  stain_size=0.25, grain=0.15, grain_size=0.03)
-SLABS = Material(colour=(0.33, 0.32, 0.30), stain_colour=(0.22, 0.21, 0.20), stain=0.6,
-                 stain_size=1.2, grain=0.08, grain_size=0.08, block=(0.5, 0.5), block_offset=0.5,
+SLABS = Material(colour=(0.33, 0.32, 0.30), stain_colour=(0.22, 0.21, 0.20), stain=0.5,
+                 stain_size=1.2, grain=0.04, grain_size=0.08, block=(0.5, 0.5), block_offset=0.5,
                  block_variation=0.12, joint=0.008, joint_colour=(0.12, 0.12, 0.11))
 COBBLES = replace(SLABS, block=(0.2, 0.14), block_variation=0.35, joint=0.02)
 CONCRETE = Material(colour=(0.36, 0.355, 0.34), stain_colour=(0.26, 0.26, 0.25), stain=0.5,
@@ -28,7 +28,8 @@ FOREST = Material(colour=(0.06, 0.09, 0.05), stain_colour=(0.1, 0.11, 0.08), sta
 EARTH = Material(colour=(0.17, 0.13, 0.09), stain_colour=(0.25, 0.2, 0.15), stain=0.8,
                  stain_size=0.8, grain=0.3, grain_size=0.15, grain_gain=0.75)
 BARK = Material(colour=(0.16, 0.12, 0.09), stain_colour=(0.24, 0.22, 0.18), stain=0.7,
-                stain_size=0.5, grain=0.45, grain_size=0.05, stretch=(1.0, 1.0, 5.0))
+                stain_size=0.5, grain=0.5, grain_size=0.08, grain_gain=0.8,
+                stretch=(1.0, 1.0, 5.0))
 METAL = Material(colour=(0.30, 0.31, 0.32), specular=0.35, exponent=45.0, stain=0.2,
                  stain_size=1.0, stain_colour=(0.22, 0.22, 0.22))
 DARK_METAL = replace(METAL, colour=(0.045, 0.05, 0.05), specular=0.15)

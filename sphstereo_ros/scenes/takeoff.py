@@ -11,6 +11,9 @@ from .scene import Scene
 from .street import daylight, hills
 
 
+_SCREED = replace(surfaces.CONCRETE, grain=0.025, crack=0.004)
+
+
 def takeoff(seed: int) -> Scene:
     """Houses about a yard; the camera starts near the origin, within 2 m, and has 8 m to rise."""
     rng = np.random.default_rng([seed, 1])
@@ -31,8 +34,8 @@ def _ground(build: Builder) -> None:
     build.add('yard', shapes.box((-5, -4.5, -0.3), (6, 5, 0)), surfaces.seeded(paving, rng))
     build.add('drive', shapes.box((6, -2.2, -0.3), (30, 1.6, -0.01)),
               surfaces.seeded(surfaces.SMOOTH_ASPHALT, rng))
-    build.add('slab', shapes.box((-1.6, -1.6, -0.2), (1.6, 1.6, 0.02)),
-              surfaces.seeded(replace(surfaces.CONCRETE, grain=0.02, stain=0.3), rng))
+    build.add('slab', shapes.box((-2.2, -2.2, -0.2), (2.2, 2.2, 0.02)),
+              surfaces.seeded(_SCREED, rng))
     build.add('path', shapes.sheet(-24, -5, 0.5, 2.0, -0.03),
               surfaces.seeded(surfaces.EARTH, rng))
     build.add('street', shapes.sheet(30, 37, -200, 200, -0.02),
@@ -73,7 +76,7 @@ def _garden(build: Builder) -> None:
         hedge = shapes.bush(rng, 14.0, 0.6, 1.2, 0.07, 16000)
         build.add('hedge', shapes.moved(hedge, -20.5, y), small)
     posts = np.array([(x, 5.9, -0.1) for x in np.arange(7, 29, 0.14)])
-    bars = [shapes.box(posts - (0.012, 0.012, 0), posts + (0.012, 0.012, 1.25))]
+    bars = [shapes.box(posts - (0.012, 0.012, 0), np.add(posts, (0.012, 0.012, 1.25)))]
     bars += [shapes.box((7, 5.88, z), (29, 5.92, z + 0.04)) for z in (0.2, 1.0)]
     build.add('fence', shapes.joined(bars), surfaces.DARK_METAL)
 
