@@ -14,28 +14,36 @@ from .config import AlignmentConfig, Config
 from .frames import AlignedWindow, Drop, Frame, Image8, Reference, RelativePose, StabilisedWindow
 from .paper import window_ratio_direction
 from .relative_pose import Correspondences, PoseEstimate, refine
-from .sphere import polar_bearings
+from .sphere import polar_angles, polar_bearings
 from .stabilisation import reduced, with_length
-from .tracking import features, follow, spacing_for
+from .tracking import Points, features, follow, spacing_for
 from .warp import PolarGrid, aligned_pair
 
 Floats = NDArray[np.float64]
 
-_MARGIN, _WRAP = 16, 16
+_MARGIN, _WRAP = 8, 8
 _POLE = 0.1  # rad round both poles, where the grid is too stretched to track
 
 
 def aligned_correspondences(reference: Image8, current: Image8, pose: RelativePose,
-                            grid: PolarGrid, count: int) -> Correspondences:
-    """Features followed between the views on the polar grid, back as bearings of each view."""
-    ref, cur, axes = aligned_pair(reference, current, pose, grid)
-    inside = np.zeros(grid.shape, bool)
-    inside[grid.wrap:-grid.wrap, np.sin(grid.theta()) > np.sin(_POLE)] = True
-    points, sigma = features(cur, spacing_for(count, grid.height), inside)
-    moved, found = follow(cur, ref, points)
-    offset = np.array([grid.margin, grid.wrap]) - 0.5
+                            grid: PolarGrid, count: int,
+                            again: Correspondences | None = None) -> Correspondences:
+    """Features followed between the views on the polar grid, back as bearings of each view.
 
-    def bearings(pixels: NDArray[np.float32]) -> Floats:
+    count : so many features at most, about; or the features of `again` are followed once more
+    """
+    ref, cur, axes = aligned_pair(reference, current, pose, grid)
+    offset = np.array([grid.margin, grid.wrap]) - 0.5
+    if again is None:
+        inside = np.zeros(grid.shape, bool)
+        inside[grid.wrap:-grid.wrap, np.sin(grid.theta()) > np.sin(_POLE)] = True
+        points, sigma = features(cur, spacing_for(count, grid.height), inside)
+    else:
+        points = polar_angles(again.current, axes) / grid.pixel + offset
+        sigma = again.sigma / grid.pixel
+    moved, found = follow(cur, ref, points)
+
+    def bearings(pixels: Points) -> Floats:
         theta, azimuth = ((pixels[found] - offset) * grid.pixel).T
         return polar_bearings(theta, azimuth, axes)
 
@@ -73,21 +81,22 @@ class Aligner:
         if self.config.method == 'paper':
             pose = window_ratio_direction(images[0], images[1], reference.pose)
             return replace(reference, pose=pose) if isinstance(pose, RelativePose) else pose
-        pose = reference.pose
+        grid = PolarGrid(height, _MARGIN, _WRAP)
+        pose, points = reference.pose, None
         for _ in range(self.config.iterations):
-            refined = self._refined(images[0], images[1], pose)
+            points = aligned_correspondences(images[0], images[1], pose, grid,
+                                             self.config.max_points, points)
+            refined = self._refined(points, pose)
             if isinstance(refined, Drop):
                 return refined
             pose = with_length(refined, reference.pose)
         return replace(reference, pose=self._with_floor(pose))
 
-    def _refined(self, reference: Image8, current: Image8,
-                 pose: RelativePose) -> PoseEstimate | Drop:
-        grid = PolarGrid(current.shape[0], _MARGIN, _WRAP)
-        points = aligned_correspondences(reference, current, pose, grid, self.config.max_points)
+    @staticmethod
+    def _refined(points: Correspondences, pose: RelativePose) -> PoseEstimate | Drop:
         if len(points) < 100:
             return Drop('alignment_failed', f'{len(points)} points with texture')
-        refined = refine(pose.rotation, -pose.direction, points, iterations=15)
+        refined = refine(pose.rotation, -pose.direction, points, iterations=12)
         if refined is None or refined.inliers.sum() < 0.3 * len(points):
             return Drop('alignment_failed', 'the aligned pair does not fit one motion')
         return refined

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +15,22 @@ from numpy.typing import NDArray
 from .config import RangeConfig
 from .frames import Image8, RelativePose
 from .jit import fast_kernel, kernel, rows_in_parallel
-from .matching import UNKNOWN, Parallax
+from .matching import Parallax
 from .warp import Map, PolarGrid, _arctan2
 
 Floats = NDArray[np.float64]
 
+NOTHING = 1e6
+
+_TILE = 64
 _CONFIDENT = 3.0  # standard deviations
 
 
 @dataclass(frozen=True)
 class InverseRange:
-    """ρ and its standard deviation, float32 (H, 2H), 1/m (or 1/baseline); NaN unknown.
+    """ρ and its standard deviation, float32 (H, 2H), 1/m (or 1/baseline).
+
+    Where nothing is known, ρ is 0 and σ is NOTHING, as good as infinite.
 
     signed : whether the match could have found parallaxes below zero (see Parallax)
     """
@@ -47,13 +51,13 @@ def _grid_angles(height: int) -> tuple[Map, Map, Map, Map]:
 
 
 @fast_kernel
-def _polar_row(cos_lat: np.float32, sin_lat: np.float32, cos_lon: Map, sin_lon: Map, axes: Map,
-               first: np.float32, wrap: np.float32, per_pixel: np.float32,
+def _polar_row(cos_lat: np.float32, sin_lat: np.float32, cos_lon: Map, sin_lon: Map, left: int,
+               count: int, axes: Map, first: np.float32, wrap: np.float32, per_pixel: np.float32,
                out: Map) -> None:  # pragma: no cover - compiled
     """Sine and cosine of θ, and column and row on the polar grid, of a row of pixels."""
     turn = np.float32(2 * np.pi)
-    for j in range(cos_lon.size):
-        x, y, z = cos_lat * sin_lon[j], -sin_lat, cos_lat * cos_lon[j]
+    for j in range(count):
+        x, y, z = cos_lat * sin_lon[left + j], -sin_lat, cos_lat * cos_lon[left + j]
         px = axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z
         py = axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z
         pz = axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z
@@ -67,17 +71,53 @@ def _polar_row(cos_lat: np.float32, sin_lat: np.float32, cos_lon: Map, sin_lon: 
 
 
 @fast_kernel
-def _sample(parallax: Map, column: Any, row: Any) -> Any:  # pragma: no cover - compiled
-    """Bilinear where the four neighbours agree to a pixel, else the nearest: edges stay sharp."""
-    c0, r0 = int(column), int(row)
-    fc, fr = column - c0, row - r0
-    a, b = parallax[r0, c0], parallax[r0, c0 + 1]
-    d, e = parallax[r0 + 1, c0], parallax[r0 + 1, c0 + 1]
-    if max(a, b, d, e) - min(a, b, d, e) < np.float32(1):
-        return (a * (1 - fc) + b * fc) * (1 - fr) + (d * (1 - fc) + e * fc) * fr
-    if fr < np.float32(0.5):
-        return a if fc < np.float32(0.5) else b
-    return d if fc < np.float32(0.5) else e
+def _sample_row(parallax: Map, sigma: Map, at: Map, count: int,
+                out: Map) -> None:  # pragma: no cover - compiled
+    """Parallax and its sigma where `at` lies on the grid.
+
+    Bilinear where the four neighbours agree to a pixel, else the nearest: edges stay sharp.
+    """
+    half, one = np.float32(0.5), np.float32(1)
+    for j in range(count):
+        column, row = at[2, j], at[3, j]
+        c0, r0 = np.int32(column), np.int32(row)
+        fc, fr = column - np.float32(c0), row - np.float32(r0)
+        a, b = parallax[r0, c0], parallax[r0, c0 + 1]
+        d, e = parallax[r0 + 1, c0], parallax[r0 + 1, c0 + 1]
+        mean = (a * (one - fc) + b * fc) * (one - fr) + (d * (one - fc) + e * fc) * fr
+        rn, cn = np.int32(row + half), np.int32(column + half)
+        smooth = max(max(a, b), max(d, e)) - min(min(a, b), min(d, e)) < one
+        out[0, j] = mean if smooth else parallax[rn, cn]
+        out[1, j] = sigma[rn >> 1, cn >> 1]
+
+
+@fast_kernel
+def _inverse_row(at: Map, found: Map, left: int, count: int, pixel: np.float32, noise: Map,
+                 rho_out: Map, sigma_out: Map) -> None:  # pragma: no cover - compiled
+    per_baseline = np.float32(1) / noise[0]
+    rotation_variance = noise[1] * noise[1]
+    direction_sigma, baseline_sigma = noise[2], noise[3]
+    one, nothing = np.float32(1), np.float32(NOTHING)
+    for j in range(count):
+        sine, cosine = at[0, j], at[1, j]
+        delta = found[0, j] * pixel
+        d2 = delta * delta
+        # sin δ to 3e-8 up to 1 rad
+        sin_d = delta * (one - d2 * np.float32(1 / 6) * (one - d2 * np.float32(1 / 20) * (
+            one - d2 * np.float32(1 / 42) * (one - d2 * np.float32(1 / 72)))))
+        cos_d = np.sqrt(max(one - sin_d * sin_d, np.float32(0)))
+        sin1 = sine * cos_d - cosine * sin_d  # θ1 = θ2 − δ
+        possible = (abs(delta) < one) & (sin1 > np.float32(1e-6))
+        per_sin1 = one / max(sin1, np.float32(1e-6))
+        rho = sin_d * per_baseline * per_sin1
+        match = found[1, j] * pixel
+        by_delta = sine * per_baseline * per_sin1 * per_sin1
+        by_direction = rho * (cosine * cos_d + sine * sin_d) * per_sin1 * direction_sigma
+        by_baseline = rho * baseline_sigma
+        spread = np.sqrt(by_delta * by_delta * (match * match + rotation_variance)
+                         + by_direction * by_direction + by_baseline * by_baseline)
+        rho_out[left + j] = rho if possible else np.float32(0)
+        sigma_out[left + j] = spread if possible else nothing
 
 
 @fast_kernel
@@ -85,37 +125,16 @@ def _rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map, sin_l
           axes: Map, parallax: Map, sigma: Map, pixel: np.float32, margin: np.float32,
           wrap: np.float32, noise: Map, rho_out: Map,
           sigma_out: Map) -> None:  # pragma: no cover - compiled
-    per_baseline = np.float32(1) / noise[0]
-    rotation_variance = noise[1] * noise[1]
-    direction_sigma, baseline_sigma = noise[2], noise[3]
-    at = np.empty((4, cos_lon.size), np.float32)
-    half, unknown = np.float32(0.5), np.float32(UNKNOWN)
-    for i in range(first, last):
-        _polar_row(cos_lat[i], sin_lat[i], cos_lon, sin_lon, axes, margin - half, wrap - half,
-                   np.float32(1) / pixel, at)
-        for j in range(cos_lon.size):
-            n = _sample(parallax, at[2, j], at[3, j])
-            sine, cosine = at[0, j], at[1, j]
-            delta = n * pixel
-            d2 = delta * delta
-            # sin δ to 3e-8 up to 1 rad
-            sin_d = delta * (1 - d2 * np.float32(1 / 6) * (1 - d2 * np.float32(1 / 20) * (
-                1 - d2 * np.float32(1 / 42) * (1 - d2 * np.float32(1 / 72)))))
-            cos_d = np.sqrt(max(1 - sin_d * sin_d, np.float32(0)))
-            sin1 = sine * cos_d - cosine * sin_d  # θ1 = θ2 − δ
-            if n == unknown or abs(delta) > 1 or sin1 <= np.float32(1e-6):
-                rho_out[i, j] = np.nan
-                sigma_out[i, j] = np.nan
-                continue
-            per_sin1 = np.float32(1) / sin1
-            rho = sin_d * per_baseline * per_sin1
-            match = sigma[int(at[3, j] + half), int(at[2, j] + half)] * pixel
-            by_delta = sine * per_baseline * per_sin1 * per_sin1
-            by_direction = rho * (cosine * cos_d + sine * sin_d) * per_sin1 * direction_sigma
-            by_baseline = rho * baseline_sigma
-            rho_out[i, j] = rho
-            sigma_out[i, j] = np.sqrt(by_delta * by_delta * (match * match + rotation_variance)
-                                      + by_direction * by_direction + by_baseline * by_baseline)
+    half = np.float32(0.5)
+    at = np.empty((4, _TILE), np.float32)
+    found = np.empty((2, _TILE), np.float32)
+    for left in range(0, cos_lon.size, _TILE):  # tiles: neighbours on the grid stay in cache
+        count = min(_TILE, cos_lon.size - left)
+        for i in range(first, last):
+            _polar_row(cos_lat[i], sin_lat[i], cos_lon, sin_lon, left, count, axes, margin - half,
+                       wrap - half, np.float32(1) / pixel, at)
+            _sample_row(parallax, sigma, at, count, found)
+            _inverse_row(at, found, left, count, pixel, noise, rho_out[i], sigma_out[i])
 
 
 def inverse_range(parallax: Parallax, grid: PolarGrid, axes: Floats, pose: RelativePose,
@@ -164,13 +183,10 @@ def fuse(estimates: list[InverseRange]) -> InverseRange:
     """
     rho, sigma, signed = estimates[0].rho.copy(), estimates[0].sigma.copy(), estimates[0].signed
     for more in estimates[1:]:
-        with np.errstate(invalid='ignore'):
-            agrees = np.abs(more.rho - rho) < _CONFIDENT * np.hypot(more.sigma, sigma)
-            w0, w1 = 1 / sigma**2, 1 / more.sigma**2
-            mean, spread = (w0 * rho + w1 * more.rho) / (w0 + w1), 1 / np.sqrt(w0 + w1)
-        rho = np.where(agrees, mean, np.where(np.isnan(rho), more.rho, rho)).astype(np.float32)
-        sigma = np.where(agrees, spread,
-                         np.where(np.isnan(sigma), more.sigma, sigma)).astype(np.float32)
+        agrees = np.abs(more.rho - rho) < _CONFIDENT * np.hypot(more.sigma, sigma)
+        w0, w1 = 1 / sigma**2, 1 / more.sigma**2
+        rho = np.where(agrees, (w0 * rho + w1 * more.rho) / (w0 + w1), rho)
+        sigma = np.where(agrees, 1 / np.sqrt(w0 + w1), sigma)
         signed = signed and more.signed
     return InverseRange(rho, sigma, signed)
 

@@ -25,7 +25,8 @@ UNKNOWN = -1000.0
 
 @dataclass(frozen=True)
 class Parallax:
-    """Parallax on a polar grid: `pixels` (or UNKNOWN) and `sigma`, float32 of the grid's shape.
+    """Parallax on a polar grid: `pixels` (or UNKNOWN), float32 of the grid's shape, and `sigma`,
+    float32 at half the grid's size: pixel (i, j) has sigma[i // 2, j // 2].
 
     A matcher whose search ends at zero cannot say that a point is beyond all range: `signed` tells
     that parallaxes about zero were searched on both sides.
@@ -46,18 +47,18 @@ _FORTH_AND_BACK = 0.5
 
 
 def structure(image: Image8, window: int = 9) -> Pixels:
-    """Root mean square of the gradient along θ in a window, grey levels per pixel, (rows, cols).
+    """Root mean square of the gradient along θ in a window, grey levels per pixel, at half size.
 
-    Computed at half size and enlarged: it varies slowly.
+    It varies slowly, so half of the rows and columns are enough.
     """
     half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     gradient = cv2.Sobel(half, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 16)
-    mean = cv2.sqrt(cv2.boxFilter(cv2.multiply(gradient, gradient), -1, (window, window)))
-    return np.asarray(cv2.resize(mean, image.shape[::-1], interpolation=cv2.INTER_LINEAR))
+    squared = cv2.multiply(gradient, gradient, dst=gradient)
+    return np.asarray(cv2.sqrt(cv2.boxFilter(squared, -1, (window, window))))
 
 
 def gradient_sigma(image: Image8) -> Pixels:
-    """Standard deviation of a match in px from the image's structure alone."""
+    """Standard deviation of a match in px from the image's structure alone, at half size."""
     return _FLOOR + np.float32(0.3 * _NOISE) / (structure(image) + np.float32(0.3))
 
 
@@ -87,7 +88,8 @@ def flow_matcher(preset: str, finest_scale: int) -> Matcher:
         back = search.calc(reference, current, None)
         loop = _forth_and_back(there, back)
         along, across = there[..., 0], there[..., 1]
-        sigma = cv2.magnitude(gradient_sigma(current), _FORTH_AND_BACK * loop)
+        half = cv2.resize(loop, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        sigma = cv2.magnitude(gradient_sigma(current), _FORTH_AND_BACK * half)
         pixels = -along
         pixels[(loop > 1) | (np.abs(across) > 1)] = UNKNOWN
         return Parallax(pixels, sigma, signed=True)

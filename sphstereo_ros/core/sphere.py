@@ -37,6 +37,13 @@ def polar_bearings(theta: ArrayLike, azimuth: ArrayLike, axes: Floats) -> Floats
     return np.asarray(polar @ axes.T)
 
 
+def polar_angles(bearings: Floats, axes: Floats) -> Floats:
+    """Polar angle θ in [0, π] and azimuth in [0, 2π) of bearings (..., 3), as (..., 2), rad."""
+    polar = np.asarray(bearings) @ axes
+    theta = np.arctan2(np.hypot(polar[..., 0], polar[..., 1]), polar[..., 2])
+    return np.stack([theta, np.arctan2(polar[..., 1], polar[..., 0]) % (2 * np.pi)], axis=-1)
+
+
 def range_from_parallax(theta2: ArrayLike, parallax: ArrayLike, baseline: float) -> Floats:
     """Range r2 seen from the current view (law of sines).
 

@@ -19,7 +19,7 @@ from .inverse_range import InverseRange, fuse, inverse_range, published_range
 from .matching import matcher
 from .warp import PolarGrid, aligned_pair
 
-_MARGIN, _WRAP = 16, 16
+_MARGIN, _WRAP = 8, 8  # even, for the half-size sigma
 
 
 class SphericalStereo:

@@ -68,7 +68,8 @@ def follow(source: Image8, target: Image8, points: Points, *, window: int = 11,
     if not len(points):
         return points, np.zeros(0, bool)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        source, target, points[:, None], None, winSize=(window, window), maxLevel=levels,
+        source, target, np.asarray(points[:, None], np.float32), None,
+        winSize=(window, window), maxLevel=levels,
         criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.003))
     return found[:, 0], status[:, 0].astype(bool)
 
