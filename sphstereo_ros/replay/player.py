@@ -13,6 +13,8 @@ from sphstereo_ros.ros.messages import SECOND
 TICK = 0.01
 # A replay that is this late (seconds) goes on from there, instead of hurrying after.
 LATE = 0.5
+# Real seconds that are not worth a sleep.
+SOON = 1e-6
 DEFAULT_PERIOD = SECOND // 10
 
 
@@ -85,7 +87,7 @@ def schedule(source: Source, names: Mapping[str, str], rate: float = 1.0, loop: 
         for record in source.records(names):
             first = record.time if first is None else first
             cdr = record.serialised()
-            if record.time < first + start_offset * SECOND or len(cdr) < 12:
+            if record.time - first < round(start_offset * SECOND) or len(cdr) < 12:
                 continue
             begin = record.time if begin is None else begin
             stamp = stamp_of(cdr)
@@ -130,7 +132,7 @@ class Player:
         """Wait until `due`, with the clock going on; returns by how much to delay the rest."""
         while not self.stopped():
             left = due.at - (self.monotonic() - start)
-            if left <= 0:
+            if left <= SOON:
                 return -left if -left > LATE else 0.0
             if left > TICK:
                 self.publish_clock(due.clock - round(left * self.rate * SECOND))
