@@ -1,0 +1,270 @@
+"""Nodes as processes over DDS, seen by a client that knows standard messages alone."""
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+import room
+from nav_msgs.msg import Odometry
+from nav_msgs.msg import Path as PathMessage
+from rclpy.qos import ReliabilityPolicy
+from ros_graph import Graph, drops, graph, mono8, nanoseconds, odometry, set_stamp
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+
+from sphstereo_ros.core.chain import Chain, StageResults
+from sphstereo_ros.core.config import resolve
+from sphstereo_ros.core.frames import Frame
+from sphstereo_ros.core.motion import OdometrySample
+
+STEP, HEIGHT = 0.15, 240
+STAGES = ('frame_pairing', 'pose_stabilisation', 'motion_alignment', 'spherical_stereo')
+
+
+@pytest.fixture
+def ros(tmp_path: Path) -> Iterator[Graph]:
+    with graph(tmp_path) as made:
+        yield made
+
+
+@cache
+def frames(count: int = 5) -> tuple[Frame, ...]:
+    return tuple(room.forward(count, STEP, HEIGHT))
+
+
+def moved(i: int) -> tuple[int, float]:
+    """Stamp and forward position of frame i."""
+    return frames()[i].key.stamp, STEP * i
+
+
+@cache
+def truth(source: str, matcher: str = 'bm') -> dict[int, StageResults]:
+    """What the core makes of the same frames, by stamp."""
+    chain = Chain(resolve({'baseline.source': source, 'stereo.matcher': matcher}))
+    results = []
+    for i, frame in enumerate(frames()):
+        stamp, x = moved(i)
+        if source == 'odometry':
+            chain.add_odometry(OdometrySample(stamp, np.array([x, 0, 0]), np.eye(3)))
+        results += chain.add_frame(frame)
+    return {r.range_image.key.stamp: r for r in results if isinstance(r, StageResults)}
+
+
+def floats(message: Image) -> np.ndarray:
+    assert (message.encoding, message.step) == ('32FC1', 4 * message.width)
+    return np.frombuffer(message.data, np.float32).reshape(message.height, message.width)
+
+
+def test_four_processes_give_what_the_core_gives(ros: Graph) -> None:
+    client = ros.client
+    for name in STAGES:
+        ros.start(name, 'baseline.source:=odometry', 'stereo.matcher:=bm')
+    topics = {'frames': Image, 'pairs': PathMessage, 'pairs/stabilised': PathMessage,
+              'pairs/aligned': PathMessage, 'depth/image': Image, 'depth/sigma': Image,
+              'depth/preview': Image, 'points': PointCloud2, 'odometry/visual': Odometry}
+    for topic, kind in topics.items():
+        client.subscribe(kind, topic)
+    for topic, readers in (('frames', 4), ('pairs', 2), ('pairs/stabilised', 2),
+                           ('pairs/aligned', 2), ('odometry/visual', 2), ('depth/image', 1)):
+        client.linked(topic, readers)
+    motion = client.publisher(Odometry, 'odometry')
+    image = client.camera(Image, 'image', 'frame_pairing')
+    for i, frame in enumerate(frames()):
+        motion.publish(odometry(*moved(i)))
+        image.publish(mono8(frame.key.stamp, frame.image))
+        if i:
+            client.stamped('points', frame.key.stamp)
+    expected = truth('odometry')
+    assert sorted(expected) == [f.key.stamp for f in frames()[1:]]
+    for stamp, result in expected.items():
+        depth, sigma = client.stamped('depth/image', stamp), client.stamped('depth/sigma', stamp)
+        assert (depth.header.frame_id, sigma.header.frame_id) == ('camera_optical',) * 2
+        np.testing.assert_allclose(floats(depth), result.range_image.range, rtol=1e-5)
+        np.testing.assert_allclose(floats(sigma), result.range_image.sigma, rtol=1e-3)
+        check_window(client.stamped('pairs/aligned', stamp), result)
+        check_cloud(client.stamped('points', stamp), result)
+        preview = client.stamped('depth/preview', stamp)
+        assert (preview.encoding, len(preview.data)) == ('bgr8', 3 * 2 * HEIGHT**2)
+    visual = client.stamped('odometry/visual', frames()[2].key.stamp)
+    assert visual.pose.pose.position.z == pytest.approx(STEP, rel=1e-3)
+    assert visual.twist.twist.linear.z == pytest.approx(STEP / 0.033333333, rel=1e-3)
+    assert visual.pose.covariance[0] > 0
+    for topic in topics:
+        for info in client.node.get_publishers_info_by_topic(topic):
+            assert info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+    for topic in ('image', 'image/compressed'):
+        info, = client.node.get_subscriptions_info_by_topic(topic)
+        assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    last = frames()[-1].key.stamp
+    client.until(lambda: set(client.statuses()) == set(STAGES), 'diagnostics of all')
+    assert nanoseconds(client.received['depth/image'][-1].header.stamp) == last
+    for name in STAGES:
+        assert set(drops(client.statuses()[name])) <= {'first_frame', 'unknown_encoding'}
+
+
+def check_window(message: PathMessage, result: StageResults) -> None:
+    """The aligned window: reference behind, current last, headers that name the frames."""
+    window = result.aligned
+    assert nanoseconds(message.header.stamp) == window.current.key.stamp
+    reference, current = message.poses
+    assert nanoseconds(reference.header.stamp) == window.references[0].frame.key.stamp
+    assert (reference.header.frame_id, current.header.frame_id) == ('camera_optical',) * 2
+    assert nanoseconds(current.header.stamp) == window.current.key.stamp
+    p = reference.pose.position
+    np.testing.assert_allclose([p.x, p.y, p.z], window.references[0].pose.position, atol=1e-9)
+    assert p.z == pytest.approx(-STEP, rel=1e-3)
+    assert (current.pose.position.z, current.pose.orientation.w) == (0.0, 1.0)
+
+
+def check_cloud(message: PointCloud2, result: StageResults) -> None:
+    """Points in base_link: the left wall is at +y of an unrotated mount."""
+    assert result.cloud is not None
+    assert message.header.frame_id == 'base_link'
+    assert [f.name for f in message.fields] == ['x', 'y', 'z', 'intensity', 'sigma']
+    points = np.frombuffer(message.data, np.float32).reshape(-1, 5)
+    np.testing.assert_allclose(points[:, :3], result.cloud.xyz, rtol=1e-5, atol=1e-5)
+    left = points[(points[:, 1] > 0) & (np.abs(points[:, ::2][:, :2]) < 0.3).all(axis=1), 1]
+    assert np.median(left) == pytest.approx(-room.LOW[0], rel=0.03)
+
+
+def test_pipeline_on_compressed_images_without_a_baseline(ros: Graph) -> None:
+    """Relative depth, never on depth/image; intermediates are there for who wants them."""
+    client = ros.client
+    ros.start('pipeline', 'stereo.matcher:=bm', 'use_sim_time:=true', '--remap __ns:=/robot')
+    for topic, kind in (('depth/relative', Image), ('depth/image', Image), ('pairs', PathMessage),
+                        ('points', PointCloud2), ('frames', Image)):
+        client.subscribe(kind, f'/robot/{topic}')
+        client.linked(f'/robot/{topic}')
+    image = client.camera(CompressedImage, '/robot/image/compressed', 'pipeline: frame_pairing')
+    for i, frame in enumerate(frames()):
+        message = CompressedImage(format='png')
+        message.data.frombytes(cv2.imencode('.png', frame.image)[1].tobytes())
+        set_stamp(message, frame.key.stamp, 'camera_optical')
+        image.publish(message)
+        sent = client.stamped('/robot/frames', frame.key.stamp)
+        np.testing.assert_array_equal(np.frombuffer(sent.data, np.uint8), frame.image.reshape(-1))
+        if i:
+            depth = client.stamped('/robot/depth/relative', frame.key.stamp)
+            np.testing.assert_allclose(
+                floats(depth), truth('fixed')[frame.key.stamp].range_image.range, rtol=1e-5)
+            window = client.stamped('/robot/pairs', frame.key.stamp)
+            assert window.poses[0].pose.position.z == pytest.approx(-1e-6)
+    assert not client.received['/robot/depth/image']
+    assert not client.received['/robot/points']
+    statuses = client.until(lambda: len(client.statuses()) == 4 and client.statuses(), 'statuses')
+    assert set(statuses) == {f'pipeline: {stage}' for stage in STAGES}
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_every_node_ends_cleanly(ros: Graph, number: int) -> None:
+    processes = [ros.start(name) for name in (*STAGES, 'pipeline')]
+    for topic, readers in (('image', 2), ('frames', 3), ('pairs/aligned', 1)):
+        ros.client.linked(topic, readers, writers=0)
+    for process in processes:
+        process.process.send_signal(number)
+    for process in processes:
+        assert process.ended() == 0, process.log
+        assert 'Traceback' not in process.log
+    ros.client.until(lambda: ros.client.node.count_publishers('/diagnostics') == 0, 'all to leave')
+
+
+def test_bad_input_is_a_named_drop_and_the_node_lives(ros: Graph) -> None:
+    client = ros.client
+    process = ros.start('pipeline', 'baseline.length:=0.15', 'stereo.matcher:=bm')
+    client.subscribe(Image, 'depth/image')
+    client.linked('depth/image')
+    image = client.camera(Image, 'image', 'pipeline: frame_pairing')
+    motion = client.publisher(Odometry, 'odometry')
+    first, second, third = frames()[:3]
+    bad = {cause: mono8(first.key.stamp, first.image) for cause in
+           ('unknown_encoding', 'wrong_data_length', 'wrong_step', 'wrong_aspect', 'empty_image')}
+    bad['unknown_encoding'].encoding = 'klingon'
+    bad['wrong_data_length'].data = bad['wrong_data_length'].data[:-7]
+    bad['wrong_step'].step = 3
+    bad['wrong_aspect'].width, bad['wrong_aspect'].step = 2 * HEIGHT * HEIGHT * 2, 0
+    bad['wrong_aspect'].height = 1
+    bad['empty_image'].height = 0
+    for cause, message in bad.items():
+        image.publish(message)
+        if cause != 'wrong_aspect':
+            client.dropped('pipeline: frame_pairing', cause)
+    motion.publish(odometry(1, float('nan')))
+    client.dropped('pipeline: frame_pairing', 'odometry_not_finite')
+    image.publish(mono8(second.key.stamp, second.image))
+    image.publish(mono8(second.key.stamp, second.image))
+    client.dropped('pipeline: frame_pairing', 'duplicate_stamp')
+    image.publish(mono8(third.key.stamp, third.image))
+    client.stamped('depth/image', third.key.stamp)
+    image.publish(mono8(third.key.stamp + 10**7, third.image))
+    client.dropped('pipeline: pose_stabilisation', 'no_parallax')
+    for changed, cause in ((mono8(third.key.stamp + 2 * 10**7, third.image, 'other'),
+                            'frame_id_changed'),
+                           (mono8(third.key.stamp, third.image, 'other'), 'stamp_backward'),
+                           (mono8(third.key.stamp + 10**10, third.image, 'other'), 'stamp_gap'),
+                           (mono8(third.key.stamp + 10**10 + 1, third.image[::2, ::2], 'other'),
+                            'size_changed')):
+        image.publish(changed)
+        client.dropped('pipeline: frame_pairing', cause)
+    assert process.process.poll() is None
+    assert 'internal_error' not in process.log
+
+
+def test_stages_name_what_is_wrong_with_windows(ros: Graph) -> None:
+    client = ros.client
+    ros.start('pose_stabilisation')
+    image, pairs = client.publisher(Image, 'frames'), client.publisher(PathMessage, 'pairs')
+    pairs.publish(PathMessage())
+    client.dropped('pose_stabilisation', 'too_few_poses')
+    broken = mono8(5, np.zeros((8, 16), np.uint8))
+    broken.encoding = 'klingon'
+    image.publish(broken)
+    client.dropped('pose_stabilisation', 'unknown_encoding')
+    for stamp in range(1, 7):
+        pairs.publish(window(stamp, stamp + 1))
+    client.dropped('pose_stabilisation', 'frame_missing', 2)
+
+
+def window(reference: int, current: int) -> PathMessage:
+    from geometry_msgs.msg import PoseStamped
+    message = PathMessage(poses=[PoseStamped(), PoseStamped()])
+    for part, stamp in ((message.poses[0], reference), (message.poses[1], current),
+                        (message, current)):
+        set_stamp(part, stamp, 'camera_optical')
+    message.poses[0].pose.position.z = -1.0
+    return message
+
+
+def test_a_node_that_comes_back_is_in_the_flow_again(ros: Graph) -> None:
+    client = ros.client
+    options = ('baseline.length:=0.15', 'stereo.matcher:=bm')
+    processes = {name: ros.start(name, *options) for name in STAGES}
+    client.subscribe(Image, 'depth/image')
+    for topic, readers in (('frames', 3), ('pairs', 1), ('pairs/stabilised', 1),
+                           ('pairs/aligned', 1), ('depth/image', 1)):
+        client.linked(topic, readers)
+    image = client.camera(Image, 'image', 'frame_pairing')
+    stamp, sent, wanted = frames()[0].key.stamp, 0, 1
+
+    def flows() -> bool:
+        """Whether one more depth image came; else sends the next frame, as a camera does."""
+        nonlocal stamp, sent
+        if len(client.received['depth/image']) >= wanted:
+            return True
+        stamp, sent = stamp + 33_333_333, sent + 1
+        image.publish(mono8(stamp, frames()[sent % 2].image))
+        return False
+    client.until(flows, 'depth')
+    processes['pose_stabilisation'].process.kill()
+    assert processes['pose_stabilisation'].ended() == -signal.SIGKILL
+    # What is under way may still come out.
+    client.linked('pairs/stabilised')
+    wanted = len(client.received['depth/image']) + 6
+    ros.start('pose_stabilisation', *options)
+    client.until(flows, 'depth after the restart')
