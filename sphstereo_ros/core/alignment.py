@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .config import AlignmentConfig, Config
 from .frames import AlignedWindow, Drop, Frame, Image8, Reference, RelativePose, StabilisedWindow
 from .paper import window_ratio_direction
-from .relative_pose import Correspondences, PoseEstimate, refine
+from .relative_pose import Correspondences, PoseEstimate, epipolar_residuals, refine
 from .sphere import polar_angles, polar_bearings
 from .stabilisation import reduced, with_length
 from .tracking import Points, features, follow, spacing_for
@@ -86,18 +86,23 @@ class Aligner:
         for _ in range(self.config.iterations):
             points = aligned_correspondences(images[0], images[1], pose, grid,
                                              self.config.max_points, points)
-            refined = self._refined(points, pose)
+            refined = self._refined(points, pose, grid.pixel)
             if isinstance(refined, Drop):
                 return refined
             pose = with_length(refined, reference.pose)
         return replace(reference, pose=self._with_floor(pose))
 
     @staticmethod
-    def _refined(points: Correspondences, pose: RelativePose) -> PoseEstimate | Drop:
+    def _refined(points: Correspondences, pose: RelativePose,
+                 threshold: float) -> PoseEstimate | Drop:
         if len(points) < 100:
             return Drop('alignment_failed', f'{len(points)} points with texture')
         refined = refine(pose.rotation, -pose.direction, points, iterations=12)
-        if refined is None or refined.inliers.sum() < 0.3 * len(points):
+        if refined is None:
+            return Drop('alignment_failed', 'the aligned pair fixes no motion')
+        # The robust loss adapts to any residuals, so inliers are counted by the threshold.
+        residual = np.abs(epipolar_residuals(refined.rotation, refined.direction, points))
+        if (refined.inliers & (residual < threshold)).sum() < 0.3 * len(points):
             return Drop('alignment_failed', 'the aligned pair does not fit one motion')
         return refined
 
