@@ -10,7 +10,6 @@ from .builder import Builder
 from .scene import Scene
 from .street import daylight, hills
 
-
 _SCREED = replace(surfaces.CONCRETE, grain=0.025, crack=0.004)
 
 
