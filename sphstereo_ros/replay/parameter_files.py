@@ -23,13 +23,15 @@ _Loader.add_implicit_resolver('tag:yaml.org,2002:float',
                               re.compile(r'^[-+]?\d+(\.\d*)?[eE][-+]?\d+$'), list('-+0123456789'))
 
 
-def load_config(files: Sequence[Path] = (), overrides: Sequence[str] = ()) -> Config:
-    """Read parameter files (later ones win) and `name:=value` overrides (which always win).
+def load_values(files: Sequence[Path] = (), overrides: Sequence[str] = ()) -> dict[str, object]:
+    """Parameters of files (later ones win) and of `name:=value` overrides (which always win).
+
+    Those of ROS itself are left out.
 
     Raises
     ------
     ParameterError
-        where a file cannot be read, or a parameter is unknown to all nodes, or refused
+        where a file or an override cannot be read
 
     """
     given: dict[str, object] = {}
@@ -38,7 +40,19 @@ def load_config(files: Sequence[Path] = (), overrides: Sequence[str] = ()) -> Co
     for text in overrides:
         name, value = _override(text)
         given[name] = value
-    return resolve({name: value for name, value in given.items() if not _of_ros(name)})
+    return {name: value for name, value in given.items() if not _of_ros(name)}
+
+
+def load_config(files: Sequence[Path] = (), overrides: Sequence[str] = ()) -> Config:
+    """The Config of parameter files and overrides.
+
+    Raises
+    ------
+    ParameterError
+        as `load_values`, or where a parameter is unknown to all nodes, or refused
+
+    """
+    return resolve(load_values(files, overrides))
 
 
 def _of_ros(name: str) -> bool:

@@ -1,0 +1,79 @@
+"""Speed of the chain, as a ratio to one StereoBM call on the same data in the same process."""
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+
+from sphstereo_ros.core.chain import Chain, StageResults
+from sphstereo_ros.core.config import resolve
+from sphstereo_ros.core.frames import Frame, FrameKey, Image8
+from sphstereo_ros.core.warp import PolarGrid, aligned_pair
+
+
+def to_and_fro(images: Sequence[Image8], count: int) -> list[Image8]:
+    """`count` images, forward then backward and so on, so that motion stays continuous."""
+    cycle = [*images, *images[-2:0:-1]] if len(images) > 2 else list(images)
+    return [cycle[i % len(cycle)] for i in range(count)]
+
+
+def measure(images: Sequence[Image8], parameters: dict[str, object], pairs: int,
+            ) -> dict[str, Any]:
+    """Time the whole chain for each new frame, and StereoBM(96, 15) on the pair it aligned.
+
+    Parameters
+    ----------
+    images : (H, 2H) uint8 frames of a moving camera
+    parameters : over the defaults
+    pairs : how many pairs are timed, after a warm-up of five
+
+    Returns
+    -------
+    `chain_ms`, `bm_ms` (medians) and their `ratio`, and medians by stage
+
+    """
+    chain = Chain(resolve({'baseline.length': 0.28, **parameters}))
+    chain.warm_up()
+    block_matcher = cv2.StereoBM_create(96, 15)
+    times: dict[str, list[float]] = {'chain_ms': [], 'bm_ms': []}
+    dropped = 0
+    for index, image in enumerate(to_and_fro(images, pairs + 6)):
+        start = time.perf_counter()
+        outcome = chain.add_frame(Frame(FrameKey(index * 33_333_333, 'camera'), image))[0]
+        taken = time.perf_counter() - start
+        if not isinstance(outcome, StageResults):
+            dropped += index > 0
+            continue
+        reference = outcome.aligned.references[0]
+        views = aligned_pair(reference.frame.image, image, reference.pose,
+                             PolarGrid(image.shape[0]))
+        start = time.perf_counter()
+        block_matcher.compute(views[1], views[0])
+        if index > 5:
+            times['bm_ms'].append(1e3 * (time.perf_counter() - start))
+            times['chain_ms'].append(1e3 * taken)
+    medians = {name: float(np.median(values)) for name, values in times.items()}
+    return {**medians, 'ratio': medians['chain_ms'] / medians['bm_ms'],
+            'pairs': len(times['chain_ms']), 'dropped': dropped}
+
+
+def stage_times(images: Sequence[Image8], parameters: dict[str, object],
+                pairs: int = 20) -> dict[str, float]:
+    """Median milliseconds of each stage."""
+    chain = Chain(resolve({'baseline.length': 0.28, **parameters}))
+    chain.warm_up()
+    times: dict[str, list[float]] = {}
+    for index, image in enumerate(to_and_fro(images, pairs + 6)):
+        window: Any = chain.pairer.add_frame(
+            Frame(FrameKey(index * 33_333_333, 'camera'), image))[0]
+        for stage in (chain.stabiliser, chain.aligner, chain.stereo):
+            if not hasattr(window, 'references'):
+                break
+            start = time.perf_counter()
+            window = stage.process(window)
+            if index > 5:
+                times.setdefault(type(stage).__name__, []).append(time.perf_counter() - start)
+    return {name: 1e3 * float(np.median(values)) for name, values in times.items()}
