@@ -1,6 +1,7 @@
 """Collects meshes by material while a scene is laid out, and builds houses, trees and cars."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,8 @@ from . import shapes, surfaces
 from .material import Material
 from .scene import Part
 from .shapes import Mesh, Rectangle
+
+Put = Callable[..., None]
 
 
 class Builder:
@@ -86,10 +89,9 @@ class Builder:
                               if low > 0.2 else low + tall))
         return holes
 
-    def _trim(self, put: object, size: tuple[float, float, float], holes: list[Rectangle],
+    def _trim(self, put: Put, size: tuple[float, float, float], holes: list[Rectangle],
               storeys: int) -> None:
         """Plinth, cornices, and now and then balconies with thin railings."""
-        assert callable(put)
         rng, (width, _, height) = self.rng, size
         doors = sorted(h[:2] for h in holes if h[2] < 0.2)
         edges = [0.0, *(e for d in doors for e in d), width]
@@ -110,8 +112,7 @@ class Builder:
                 put('railing', shapes.railing(x0 - 0.4, x1 + 0.4, 0.88, z + 0.12),
                     surfaces.DARK_METAL)
 
-    def _roof(self, put: object, size: tuple[float, float, float], material: Material) -> None:
-        assert callable(put)
+    def _roof(self, put: Put, size: tuple[float, float, float], material: Material) -> None:
         width, depth, height = size
         if height < 9 or self.rng.random() < 0.4:
             rise = 0.35 * depth * float(self.rng.uniform(0.7, 1.1))

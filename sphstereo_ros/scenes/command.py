@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from tqdm import tqdm
@@ -73,8 +74,11 @@ def _problem(args: argparse.Namespace) -> str:
     return ''
 
 
-def _bar(total: int):  # type: ignore[no-untyped-def]
-    return lambda frames: tqdm(frames, total=total, unit='frame')
+def _bar(total: int) -> Callable[[Iterator[int]], Iterator[int]]:
+    def bar(frames: Iterator[int]) -> Iterator[int]:
+        return iter(tqdm(frames, total=total, unit='frame'))
+
+    return bar
 
 
 def render_sample(folder: str | Path) -> None:

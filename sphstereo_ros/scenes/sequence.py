@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -26,6 +26,10 @@ from .imaging import (
     with_noise,
 )
 from .trajectory import BODY_FROM_OPTICAL, Trajectory, climb, drive, mounted, shaken
+
+if TYPE_CHECKING:  # reading a folder needs no ray caster
+    from .render import Camera
+    from .scene import Scene
 
 Array = NDArray[Any]
 
@@ -86,7 +90,7 @@ class ImageEffects:
 class RenderedSequence(Sequence[TruthFrame]):
     """Frames of a scene along a trajectory, each rendered when it is asked for."""
 
-    def __init__(self, scene: Any, trajectory: Trajectory, height: int, seed: int,
+    def __init__(self, scene: Scene, trajectory: Trajectory, height: int, seed: int,
                  effects: ImageEffects) -> None:
         self.scene = scene
         self.trajectory = trajectory
@@ -119,7 +123,7 @@ class RenderedSequence(Sequence[TruthFrame]):
         return TruthFrame(stamp_of(index), picture, camera.range(), camera.rotation,
                           camera.position, exposure, data)
 
-    def camera(self, index: int, height: int | None = None) -> Any:
+    def camera(self, index: int, height: int | None = None) -> Camera:
         """The camera of frame `index`, at this sequence's or another height."""
         from .render import Camera
         return Camera(self.scene, self.trajectory.rotations[index],
@@ -127,12 +131,11 @@ class RenderedSequence(Sequence[TruthFrame]):
 
 
 @lru_cache(maxsize=1)
-def _build(name: str, seed: int) -> Any:
-    # Imported late: reading a folder needs no ray caster.
+def _build(name: str, seed: int) -> Scene:
     from .corridor import corridor
     from .street import street
     from .takeoff import takeoff
-    builders: dict[str, Callable[[int], Any]] = {
+    builders: dict[str, Callable[[int], Scene]] = {
         'street': street, 'takeoff': takeoff, 'corridor': corridor}
     return builders[name](seed)
 

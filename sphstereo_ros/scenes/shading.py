@@ -273,6 +273,35 @@ def _sunward(light: Any, sample: int, samples: int, toward: Array) -> None:
 
 
 @fast_kernel
+def _into_part(place: Array, point: Array, normal: Array, ray: Array, here: Array, there: Array,
+               view: Array) -> None:
+    """Point, normal and ray in the axes of the part that is placed by `place` (3, 4)."""
+    for a in range(3):
+        here[a] = there[a] = view[a] = 0.0
+        for b in range(3):
+            here[a] += place[b, a] * (point[b] - place[b, 3])
+            there[a] += place[b, a] * normal[b]
+            view[a] += place[b, a] * ray[b]
+
+
+@fast_kernel
+def _sunlight(light: Any, material: Any, normal: Array, toward: Array) -> float:
+    """Sunlight on the surface, some of it from behind through a leaf."""
+    facing = normal[0] * toward[0] + normal[1] * toward[1] + normal[2] * toward[2]
+    lit: float = light.sun_strength * max(facing, -material.translucent * facing)
+    return lit
+
+
+@fast_kernel
+def _leave(point: Array, flat: Array, toward: Array, start: Array) -> None:
+    """Where a ray along `toward` starts: off the surface, on the side that it leaves to."""
+    side = flat[0] * toward[0] + flat[1] * toward[1] + flat[2] * toward[2]
+    lift = math.copysign(_SHADOW_LIFT, side)
+    for a in range(3):
+        start[a] = point[a] + lift * flat[a]
+
+
+@fast_kernel
 def shade(samples: int, origins: Array, rays: Array, distance: Array, travelled: Array,
           angle: float, faces: Array, corners: Array, face_normals: Array, corner_normals: Array,
           face_part: Array, placements: Array, materials: Array, light: Any, lamps: Array,
@@ -301,17 +330,11 @@ def shade(samples: int, origins: Array, rays: Array, distance: Array, travelled:
             continue
         part = face_part[face]
         material = materials[part]
-        place = placements[part]
         for a in range(3):
             point[a] = origins[i, a] + distance[i] * ray[a]
             flat[a] = face_normals[face, a]
         _corner_normal(corner_normals, face, corners[i, 0], corners[i, 1], ray, flat, normal)
-        for a in range(3):
-            here[a] = there[a] = view[a] = 0.0
-            for b in range(3):
-                here[a] += place[b, a] * (point[b] - place[b, 3])
-                there[a] += place[b, a] * flat[b]
-                view[a] += place[b, a] * ray[b]
+        _into_part(placements[part], point, flat, ray, here, there, view)
         texture(material, here, there, view, angle * (travelled[i] + distance[i]), face, colour)
         if material.face_tilt > 0:
             _tilt(normal, face, material.face_tilt, material.seed)
@@ -322,9 +345,7 @@ def shade(samples: int, origins: Array, rays: Array, distance: Array, travelled:
             rest, near, reach = _lamplight(lamps, point, normal, toward)
         else:
             _sunward(light, i % samples, samples, toward)
-            near = light.sun_strength * (normal[0] * toward[0] + normal[1] * toward[1]
-                                         + normal[2] * toward[2])
-            near = max(near, -material.translucent * near)
+            near = _sunlight(light, material, normal, toward)
         shine = 0.0
         if material.specular > 0 and near > 0:
             if lamps.shape[0] == 0:
@@ -337,16 +358,12 @@ def shade(samples: int, origins: Array, rays: Array, distance: Array, travelled:
             direct[i, c] = (colour[c] * near + shine) * light.sun_colour[c]
         if near > 0:
             shadow_length[i] = max(reach - 0.3, 1e-3) if lamps.shape[0] else reach
-            side = 1.0 if (flat[0] * toward[0] + flat[1] * toward[1]
-                           + flat[2] * toward[2]) > 0 else -1.0
-            for a in range(3):
-                shadow_from[i, a] = point[a] + side * _SHADOW_LIFT * flat[a]
-                shadow_to[i, a] = toward[a]
+            shadow_to[i] = toward
+            _leave(point, flat, toward, shadow_from[i])
         if material.mirror > 0:
             cosine = -(normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2])
             mirror[i] = material.mirror + (1 - material.mirror) * (1 - max(0.0, cosine)) ** 5
             for a in range(3):
                 mirror_rays[i, a] = ray[a] + 2 * cosine * normal[a]
-                if not near > 0:
-                    shadow_from[i, a] = point[a] + _SHADOW_LIFT * flat[a]
-
+            if not near > 0:
+                _leave(point, flat, mirror_rays[i], shadow_from[i])
