@@ -2,8 +2,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
+
+import yaml
 
 from sphstereo_ros.core.config import PARAMETERS, Config, Parameter, ParameterError, resolve
 
@@ -29,14 +31,41 @@ def names_of(node: str) -> tuple[str, ...]:
     return tuple(name for name in PARAMETERS if name.startswith(NODE_PARAMETERS[node]))
 
 
-def given_overrides(node: Any) -> dict[str, object]:
-    """Overrides (command line, parameter files) that reach `node`, without those of ROS itself.
+def given_overrides(node: Any, words: Sequence[str] = ()) -> dict[str, object]:
+    """Overrides that reach `node`, without those of ROS itself.
 
-    `[]` has no type and arrives as None; lists arrive as lists.
+    `[]` has no type and arrives as None; lists arrive as lists. `words` is the command line:
+    rcl lets a file win over `-p` where both have different types (2 and 0.5) or the file comes
+    later, so what `-p` says is taken from there.
     """
-    return {name: plain(parameter.value)
-            for name, parameter in node._parameter_overrides.items()
-            if name not in ROS_NAMES and not name.startswith(ROS_PREFIX)}
+    given = {name: plain(parameter.value)
+             for name, parameter in node._parameter_overrides.items()
+             if name not in ROS_NAMES and not name.startswith(ROS_PREFIX)}
+    told = dict(_assignments(words, node.get_name()))
+    return {name: told.get(name, value) for name, value in given.items()}
+
+
+def _assignments(words: Sequence[str], node: str) -> Iterator[tuple[str, object]]:
+    """Names and values of `-p [node:]name:=value` among the ROS arguments."""
+    of_ros = False
+    for word, following in zip(words, [*words[1:], ''], strict=False):
+        if word in ('--ros-args', '--'):
+            of_ros = word == '--ros-args'
+        elif of_ros and word in ('-p', '--param'):
+            name, _, text = following.partition(':=')
+            target, _, name = name.rpartition(':')
+            if target in ('', node):
+                yield name, _parsed(name, text)
+
+
+def _parsed(name: str, text: str) -> object:
+    value: object = yaml.safe_load(text)
+    if isinstance(value, str) and name in PARAMETERS and PARAMETERS[name].kind is float:
+        try:
+            return float(value)  # YAML 1.1 takes 1e-3 for a word
+        except ValueError:
+            return value
+    return value
 
 
 def plain(value: Any) -> object:
@@ -88,8 +117,8 @@ class NodeParameters:
 
     """
 
-    def __init__(self, node: Any, names: Iterable[str]) -> None:
-        """Declare `names` on `node`.
+    def __init__(self, node: Any, names: Iterable[str], words: Sequence[str] = ()) -> None:
+        """Declare `names` on `node`, which was started by the command line `words`.
 
         Raises
         ------
@@ -99,7 +128,7 @@ class NodeParameters:
         """
         self.on_change: Callable[[Config], None] = lambda config: None
         self._node = node
-        self._given = given_overrides(node)
+        self._given = given_overrides(node, words)
         self.config = resolve(self._given)
         checked = {name: PARAMETERS[name].checked(value) for name, value in self._given.items()}
         for name in names:

@@ -12,8 +12,16 @@ import cv2
 import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import (
+    InvalidParameterException,
+    InvalidParameterTypeException,
+    InvalidParameterValueException,
+    NameValidationException,
+)
 from rclpy.executors import ExternalShutdownException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import InvalidQosOverridesError
 
 from sphstereo_ros.core.config import Config, ParameterError
 from sphstereo_ros.core.frames import Drop, Image8
@@ -24,6 +32,12 @@ from sphstereo_ros.ros.monitor import Monitor
 from sphstereo_ros.ros.parameters import NodeParameters, names_of
 from sphstereo_ros.ros.transport import prepare_process
 from sphstereo_ros.ros.worker import Worker
+
+# What ROS raises where its own arguments or parameters are wrong.
+BAD_ARGUMENTS = (InvalidParameterException, InvalidParameterTypeException,
+                 InvalidParameterValueException, NameValidationException, InvalidQosOverridesError)
+BAD_COMMAND_LINE = (rclpy_implementation.RCLError, rclpy_implementation.RCLInvalidROSArgsError,
+                    rclpy_implementation.UnknownROSArgsError)
 
 USAGE = ('usage: {name} [--ros-args [-p NAME:=VALUE] [--params-file FILE] [-r FROM:=TO] …]\n'
          'parameters: ros2 param describe, or: python -m sphstereo_ros.ros.parameters')
@@ -70,10 +84,10 @@ class Output:
 class Shell:
     """One ROS node: its parameters, topics, monitors and workers."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, words: Sequence[str] = ()) -> None:
         self.node = rclpy.create_node(name)
         self.log = self.node.get_logger()
-        self.parameters = NodeParameters(self.node, names_of(name))
+        self.parameters = NodeParameters(self.node, names_of(name), words)
         self.mask = read_mask(self.config.camera.mask)
         self._monitors: list[Monitor] = []
         self._workers: list[Worker] = []
@@ -162,7 +176,11 @@ def read_mask(path: str) -> Image8 | None:
     """Read `camera.mask`: (H, W), non-zero = vehicle; None for an empty path."""
     if not path:
         return None
-    mask = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError:
+        data = np.empty(0, np.uint8)
+    mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
     if mask is None:
         raise ParameterError(f'camera.mask: cannot read an image from {path}')
     return np.asarray(mask, np.uint8)
@@ -178,20 +196,14 @@ def run(name: str, build: Callable[[Shell], Sequence[Component]],
     prepare_process()
     shell = None
     try:
-        stray = rclpy.utilities.remove_ros_args(words)[1:]
+        stray = _init(words)
         if stray:
             return _usage(name, stray)
-        rclpy.init(args=words)
-        shell = Shell(name)
+        shell = Shell(name, words)
         _work(shell, build)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except ParameterError as error:
-        return _refuse(name, str(error))
-    except Exception as error:
-        # Whatever ROS says of its arguments is bad usage as long as there is no node.
-        if shell is not None or not _about_arguments(error):
-            raise
+    except (ParameterError, *BAD_ARGUMENTS) as error:
         return _refuse(name, str(error).splitlines()[0])
     finally:
         # A launch system may send SIGINT twice.
@@ -200,6 +212,15 @@ def run(name: str, build: Callable[[Shell], Sequence[Component]],
             shell.close()
         rclpy.try_shutdown()
     return 0
+
+
+def _init(words: Sequence[str]) -> list[str]:
+    """Start ROS; returns the words that are not for it."""
+    try:
+        rclpy.init(args=words)
+        return list(rclpy.utilities.remove_ros_args(words))[1:]
+    except BAD_COMMAND_LINE as error:
+        raise ParameterError(f'bad ROS arguments: {error}') from error
 
 
 def _work(shell: Shell, build: Callable[[Shell], Sequence[Component]]) -> None:
@@ -215,10 +236,6 @@ def _work(shell: Shell, build: Callable[[Shell], Sequence[Component]]) -> None:
     shell.parameters.on_change = changed
     shell.log.info('ready')
     shell.spin()
-
-
-def _about_arguments(error: Exception) -> bool:
-    return type(error).__name__ in ('RCLError', 'RCLInvalidROSArgsError', 'UnknownROSArgsError')
 
 
 def _refuse(name: str, reason: str) -> int:
