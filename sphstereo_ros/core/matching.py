@@ -20,7 +20,7 @@ from .jit import kernel, rows_in_parallel
 
 Pixels = NDArray[np.float32]
 
-UNKNOWN = -1000.0
+UNKNOWN = -1e5  # more than a turn at any size
 
 
 @dataclass(frozen=True)
