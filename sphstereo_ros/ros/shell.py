@@ -154,6 +154,10 @@ class Shell:
         try:
             while rclpy.ok():
                 executor.spin_once(timeout_sec=1.0)
+        except Exception:
+            # The context may end in the midst of a callback, which then cannot publish.
+            if rclpy.ok():
+                raise
         finally:
             executor.remove_node(self.node)
 
