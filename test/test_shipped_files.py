@@ -1,0 +1,134 @@
+"""Every shipped configuration passes the check; launch files start what they should."""
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sphstereo_ros.core import rotations
+from sphstereo_ros.core.config import PARAMETERS, Config
+from sphstereo_ros.replay.parameter_files import load_config, read_file
+
+ROOT = Path(__file__).resolve().parent.parent
+CONFIGS = sorted((ROOT / 'config').glob('*.yaml'))
+STAGES = ['frame_pairing', 'pose_stabilisation', 'motion_alignment', 'spherical_stereo']
+
+
+def test_there_are_configs() -> None:
+    assert [c.name for c in CONFIGS] == ['default.yaml', 'live.yaml', 'paper.yaml']
+
+
+@pytest.mark.parametrize('file', CONFIGS, ids=lambda f: f.stem)
+def test_config_passes_the_check_and_leaves_the_baseline_open(file: Path) -> None:
+    given = read_file(file)
+    config = load_config([file])
+    assert given
+    for name in ('baseline.length', 'pairing.intervals', 'pairing.baselines'):
+        assert given.get(name, 0.0) == 0.0
+    assert load_config([file], ['pairing.baselines:=[1.0]', 'baseline.length:=0.3']
+                       ).pairing.baselines == (1.0,)
+    assert (config == Config()) == (file.stem == 'default')
+
+
+def test_default_config_states_the_defaults() -> None:
+    for name, value in read_file(ROOT / 'config' / 'default.yaml').items():
+        assert value == PARAMETERS[name].default
+    assert load_config([ROOT / 'config' / 'paper.yaml']).alignment.method == 'paper'
+    assert load_config([ROOT / 'config' / 'live.yaml']).stereo.working_height == 480
+
+
+class Recorded:
+    """Stands for any class of launch: remembers what it was made with."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.args, self.kwargs = args, kwargs
+
+
+class Value(Recorded):
+    """A LaunchConfiguration: performs to the context's value of its name."""
+
+    def perform(self, context: dict[str, str]) -> str:
+        return context[self.args[0]]
+
+
+@pytest.fixture
+def launch_modules(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The launch API as far as the launch files use it: it cannot be installed everywhere."""
+    names: dict[str, dict[str, Any]] = {
+        'launch': {'LaunchDescription': Recorded},
+        'launch.actions': dict.fromkeys(
+            ('DeclareLaunchArgument', 'EmitEvent', 'IncludeLaunchDescription', 'OpaqueFunction',
+             'RegisterEventHandler'), Recorded),
+        'launch.event_handlers': {'OnProcessExit': Recorded},
+        'launch.events': {'Shutdown': Recorded},
+        'launch.launch_description_sources': {'PythonLaunchDescriptionSource': Recorded},
+        'launch.substitutions': {'LaunchConfiguration': Value},
+        'launch_ros': {}, 'launch_ros.actions': {'Node': type('Node', (Recorded,), {})},
+        'ament_index_python': {},
+        'ament_index_python.packages': {'get_package_share_directory': lambda _: str(ROOT)},
+    }
+    for name, content in names.items():
+        module = ModuleType(name)
+        module.__dict__.update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+
+
+def performed(file: str, **given: str) -> list[Any]:
+    """The actions of a launch file for these arguments; its defaults stand for the others."""
+    description = runpy.run_path(str(ROOT / 'launch' / file))['generate_launch_description']()
+    *declared, opaque = description.args[0]
+    defaults = {d.args[0]: d.kwargs['default_value'] for d in declared
+                if 'default_value' in d.kwargs}
+    assert set(given) <= {d.args[0] for d in declared}
+    return list(opaque.kwargs['function']({**defaults, **given}))
+
+
+def nodes(actions: list[Any]) -> list[dict[str, Any]]:
+    return [a.kwargs for a in actions if type(a).__name__ == 'Node']
+
+
+@pytest.mark.usefixtures('launch_modules')
+def test_pipeline_launch(tmp_path: Path) -> None:
+    file = tmp_path / 'mount.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    camera.mount: {x: 0.5, yaw: 1.25}\n')
+    started = nodes(performed('pipeline_launch.py', params_file=str(file), namespace='robot'))
+    assert [n['executable'] for n in started] == [*STAGES, *['static_transform_publisher'] * 2]
+    for node in started[:4]:
+        assert node['package'] == 'sphstereo_ros'
+        assert node['parameters'] == [str(file), {'use_sim_time': False}]
+        assert node['namespace'] == 'robot'
+    mount, optical = (arguments(node) for node in started[4:])
+    assert (mount['--x'], mount['--yaw'], mount['--frame-id'],
+            mount['--child-frame-id']) == ('0.5', '1.25', 'base_link', 'camera_link')
+    turned = rotations.matrix_from_rpy(*(float(optical[f'--{axis}'])
+                                         for axis in ('roll', 'pitch', 'yaw')))
+    np.testing.assert_allclose(turned, rotations.OPTICAL_FROM_LINK.T, atol=1e-12)
+    assert (optical['--frame-id'], optical['--child-frame-id']) == ('camera_link',
+                                                                   'camera_optical')
+
+
+def arguments(node: dict[str, Any]) -> dict[str, str]:
+    words = node['arguments']
+    return dict(zip(words[::2], words[1::2], strict=True))
+
+
+@pytest.mark.usefixtures('launch_modules')
+def test_replay_launch() -> None:
+    include, replay, ended = performed('replay_launch.py', bag='a.mcap', rate='0.5')
+    assert Path(include.args[0].args[0]).is_file()
+    assert dict(include.kwargs['launch_arguments'])['use_sim_time'] == 'true'
+    parameters, = replay.kwargs['parameters']
+    assert (parameters['replay.bag'], parameters['replay.rate']) == ('a.mcap', 0.5)
+    assert set(parameters) <= set(PARAMETERS)
+    assert ended.args[0].kwargs['target_action'] is replay
+
+
+def test_launch_files_load_with_the_real_launch() -> None:
+    pytest.importorskip('launch_ros')
+    for file in (ROOT / 'launch').glob('*_launch.py'):
+        assert runpy.run_path(str(file))['generate_launch_description']()
