@@ -89,7 +89,7 @@ def flow_matcher(preset: str, finest_scale: int) -> Matcher:
         loop = _forth_and_back(there, back)
         along, across = there[..., 0], there[..., 1]
         half = cv2.resize(loop, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        sigma = cv2.magnitude(gradient_sigma(current), _FORTH_AND_BACK * half)
+        sigma = _length(gradient_sigma(current), _FORTH_AND_BACK * half)
         pixels = -along
         pixels[(loop > 1) | (np.abs(across) > 1)] = UNKNOWN
         return Parallax(pixels, sigma, signed=True)
@@ -104,8 +104,14 @@ def _forth_and_back(there: Pixels, back: Pixels) -> Pixels:
     v = there[..., 1] + np.arange(rows, dtype=np.float32)[:, None]
     returned = cv2.remap(back, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     loop = there + returned
-    return np.asarray(cv2.magnitude(np.ascontiguousarray(loop[..., 0]),
-                                    np.ascontiguousarray(loop[..., 1])))
+    return _length(loop[..., 0], loop[..., 1])
+
+
+def _length(a: Pixels, b: Pixels) -> Pixels:
+    """√(a² + b²). (The last bit of `cv2.magnitude` differs from call to call.)"""
+    squared = a * a
+    squared += b * b
+    return np.sqrt(squared, out=squared)
 
 
 @kernel
