@@ -111,7 +111,7 @@ def _length(a: Pixels, b: Pixels) -> Pixels:
     """√(a² + b²). (The last bit of `cv2.magnitude` differs from call to call.)"""
     squared = a * a
     squared += b * b
-    return np.sqrt(squared, out=squared)
+    return np.asarray(np.sqrt(squared, out=squared))
 
 
 @kernel
