@@ -23,6 +23,8 @@ from sphstereo_ros.ros.shell import Shell, run
 
 # Seconds for the last messages to arrive before the node ends.
 LAST_ARRIVAL = 5.0
+# Seconds by which a subscriber may find its publisher later than the publisher finds it.
+SETTLING = 0.5
 
 
 class BagReplay:
@@ -83,6 +85,7 @@ class BagReplay:
         images = [p for name, p in self._publishers.items() if 'image' in name]
         while rclpy.ok() and time.monotonic() < end:
             if any(p.get_subscription_count() for p in images):
+                time.sleep(SETTLING)
                 return
             time.sleep(0.02)
 
