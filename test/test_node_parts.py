@@ -152,28 +152,26 @@ def test_worker_survives_a_failing_job() -> None:
     assert [type(e) for e in blocked.errors] == [IndexError]
 
 
-def test_worker_makes_a_producer_wait() -> None:
+def test_worker_makes_a_producer_wait_until_it_is_free() -> None:
     blocked = Blocked()
-    blocked.worker.put_when_free(blocked.job('a'))
-    second = threading.Thread(target=blocked.worker.put_when_free, args=(blocked.job('b'),))
-    second.start()
-    second.join(0.1)
-    assert second.is_alive()
+    producer = threading.Thread(target=blocked.worker.put_when_free, args=(blocked.job('a'),))
+    producer.start()
+    producer.join(0.1)
+    assert producer.is_alive()
     blocked._open.set()
-    second.join(DEADLINE)
-    assert not second.is_alive()
-    assert blocked.release() == ['a', 'b']
+    producer.join(DEADLINE)
+    assert not producer.is_alive()
+    assert blocked.release() == ['a']
     assert blocked.superseded == 0
 
 
 def test_worker_stops_a_waiting_producer() -> None:
     blocked = Blocked()
-    blocked.worker.put_when_free(blocked.job('a'))
-    second = threading.Thread(target=blocked.worker.put_when_free, args=(blocked.job('b'),))
-    second.start()
+    producer = threading.Thread(target=blocked.worker.put_when_free, args=(blocked.job('a'),))
+    producer.start()
     blocked.worker.stop(timeout=0)
-    second.join(DEADLINE)
-    assert not second.is_alive()
+    producer.join(DEADLINE)
+    assert not producer.is_alive()
     blocked._open.set()
 
 

@@ -136,6 +136,8 @@ class Shell:
 
     def failed(self, monitor: Monitor, error: Exception) -> None:
         """Count an exception; the first of a stage is logged with its traceback."""
+        if not rclpy.ok():  # nothing can be published any more: that is no failure
+            return
         lines = traceback.format_exception(error)
         fresh = monitor.count('internal_error') == 0
         monitor.dropped(Drop('internal_error', f'{type(error).__name__}: {error}'))

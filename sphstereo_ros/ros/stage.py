@@ -79,8 +79,7 @@ class StageComponent(Generic[In, Made]):
         self._worker.put(exchange)
 
     def hand_over(self, window: In, arrival: float) -> None:
-        """Take a window from the stage before, in this process; waits while one is in the queue.
-        """
+        """Take a window from the stage before, in this process; waits until this one is free."""
         self.monitor.arrived()
         self._worker.put_when_free(partial(self._process, window, arrival))
 

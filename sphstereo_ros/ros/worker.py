@@ -24,7 +24,7 @@ class Worker:
         self._capacity = capacity
         self._jobs: deque[tuple[Job, bool]] = deque()
         self._changed = threading.Condition()
-        self._stopped = False
+        self._stopped = self._busy = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -48,10 +48,13 @@ class Worker:
             self._on_superseded()
 
     def put_when_free(self, job: Job) -> None:
-        """Wait until the queue has room, then queue a job: nothing done so far is thrown away."""
+        """Wait until there is nothing to do here, then queue a job.
+
+        What the caller has done so far is not thrown away, and does not grow old in a queue.
+        """
         with self._changed:
-            self._changed.wait_for(lambda: self._stopped or len(self._jobs) < self._capacity)
-            self._jobs.append((job, True))
+            self._changed.wait_for(lambda: self._stopped or not (self._jobs or self._busy))
+            self._jobs.append((job, False))
             self._changed.notify_all()
 
     def stop(self, timeout: float = 5.0) -> None:
@@ -68,8 +71,11 @@ class Worker:
                 if self._stopped:
                     return
                 job, _ = self._jobs.popleft()
-                self._changed.notify_all()
+                self._busy = True
             try:
                 job()
             except Exception as error:
                 self._on_error(error)
+            with self._changed:
+                self._busy = False
+                self._changed.notify_all()
