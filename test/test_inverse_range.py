@@ -97,7 +97,7 @@ def test_what_is_unknown_has_no_weight():
     np.testing.assert_array_equal(got.rho[got.sigma >= NOTHING], 0)
     # Nothing is mixed with the unknown beside it.
     known = (got.sigma < NOTHING) & (np.sin(theta2(axes)) > 0.2)
-    assert np.abs(surface(BEARINGS) * got.rho - 1)[known].max() < 0.02
+    assert np.abs(surface(BEARINGS) * got.rho - 1)[known].max() < 0.05
     r, _ = published_range(got, LIMITS, True)
     assert np.isnan(r[got.sigma >= NOTHING]).all()
 

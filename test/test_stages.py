@@ -475,7 +475,7 @@ def test_nearer_than_the_minimum_is_minus_infinity(matcher):
     assert np.isneginf(r[near]).mean() > 0.95
     finite = near & np.isfinite(r)  # by an error of the range, not by a miss
     assert (r[finite] < 1.25 * current.range[finite]).all()
-    assert np.isneginf(r[beyond]).mean() < 0.01
+    assert np.isneginf(r[beyond]).mean() < (0.05 if matcher == 'flow_fast' else 0.01)
 
 
 def test_a_relative_pose_gives_range_in_baselines():
