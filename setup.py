@@ -16,7 +16,7 @@ setup(
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
         (f'share/{NAME}/launch', glob('launch/*_launch.py')),
-        (f'share/{NAME}/config', glob('config/*')),
+        (f'share/{NAME}/config', glob('config/*.yaml')),
     ],
     python_requires='>=3.10',
     install_requires=['numpy>=1.26', 'opencv-python-headless>=4.6', 'numba>=0.58', 'PyYAML',
@@ -35,6 +35,6 @@ setup(
     license='Apache-2.0',
     entry_points={
         'console_scripts': ['sphstereo = sphstereo_ros.cli:main']
-        + [f'{node} = {NAME}.nodes.{node}:main' for node in NODES],
+        + [f'{node} = {NAME}.cli.nodes:{node}' for node in NODES],
     },
 )
