@@ -201,6 +201,18 @@ def test_bad_images_and_samples_are_counted_by_cause(bag, frames, tmp_path, caps
     assert len(results(out)['/depth/relative']) == 3
 
 
+def test_frame_that_waits_for_odometry_at_the_end_is_accounted_for(frames, tmp_path, capsys):
+    messages = [('/image', f.key.stamp, convert.frame_message(make, f)) for f in frames]
+    moved = odometry(0)
+    moved.header.stamp = convert.time_message(make, frames[0].key.stamp)
+    messages.insert(0, ('/odometry', frames[0].key.stamp, moved))
+    assert run('run', write_bag(tmp_path / 'short', messages), *FAST, '-p',
+               'baseline.source:=odometry', '--out', tmp_path / 'out.mcap') == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:3] == ['frames in: 4', 'windows: 0', 'depth images: 0']
+    assert sum(int(line.split(': ')[1]) for line in lines if line.startswith('dropped')) == 4
+
+
 def test_truncated_bag_gives_what_there_is_and_a_warning(bag, tmp_path, capsys):
     cut, out = tmp_path / 'cut.mcap', tmp_path / 'out.mcap'
     with McapOutput(tmp_path / 'many.mcap') as output:  # several chunks

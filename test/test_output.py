@@ -162,3 +162,21 @@ def test_flipped_byte_is_noticed(tmp_path, seed):
 def test_folder_that_is_not_there(tmp_path):
     with pytest.raises(BadInput, match='cannot write'):
         McapOutput(tmp_path / 'none' / 'results.mcap')
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_flipped_byte_is_noticed_without_an_index_too(tmp_path, seed):
+    path = tmp_path / 'results.mcap'
+    random = np.random.default_rng(seed)
+    output = McapOutput(path)
+    for k in range(8):
+        image = random.integers(0, 256, (512, 1024, 3), np.uint8)
+        output.write('/frames', T0 + k, convert.image_message(make, FrameKey(T0, ''), image))
+    content = bytearray(path.read_bytes())  # as a killed process leaves it
+    output.close()
+    content[len(content) // 2 + int(random.integers(1000))] ^= 1
+    path.write_bytes(content)
+    source = open_source(path)
+    count = len(list(source.records(['/frames'])))
+    assert 0 < count < 6
+    assert f'truncated after {count} messages' in source.problem
