@@ -111,7 +111,7 @@ def test_drops_of_every_stage_are_returned_and_the_chain_goes_on():
     assert causes[2] in {'too_few_points', 'too_few_inliers'}  # its reference is black
     assert causes == ['first_frame', 'too_few_points', causes[2], 'no_parallax']
     after = chain.add_frame(replace(one, key=FrameKey(4 * PERIOD, 'camera_optical'),
-                                    image=two.image))
+                                    image=three.image))
     assert isinstance(after[0], StageResults)
 
 
