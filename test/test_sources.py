@@ -304,6 +304,13 @@ def test_folder_of_frames(tmp_path):
     assert frames[1].key == FrameKey(FIRST_STAMP + 50_000_000, 'camera_optical')
 
 
+def test_mask_beside_the_frames_is_no_frame(tmp_path):
+    for name in ('1.jpg', '2.JPG', 'mask.png'):
+        cv2.imwrite(str(tmp_path / name), np.zeros((16, 32), np.uint8))
+    source = open_source(tmp_path)
+    assert source.count(source.topics) == 2
+
+
 def test_folder_of_portraits_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / 'a.jpg'), np.zeros((64, 32), np.uint8))
     with pytest.raises(BadInput, match='no full sphere'):

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -121,12 +122,19 @@ def natural_order(path: Path) -> list[tuple[int, int, str]]:
             for part in re.split(r'(\d+)', path.name)]
 
 
+def _frame_files(path: Path) -> list[Path]:
+    """Frames in order: the files of the commonest kind (a mask may lie beside them)."""
+    files = [p for p in path.iterdir() if p.suffix.lower() in FRAME_SUFFIXES]
+    kinds = Counter(p.suffix.lower() for p in files)
+    commonest = max(sorted(kinds), key=kinds.__getitem__, default='')
+    return sorted((p for p in files if p.suffix.lower() == commonest), key=natural_order)
+
+
 class FolderSource:
     """A folder of JPEG or PNG frames, at a fixed rate, as a source of compressed images."""
 
     def __init__(self, path: Path, fps: float = 0.0) -> None:
-        self._files = sorted((p for p in path.iterdir() if p.suffix.lower() in FRAME_SUFFIXES),
-                             key=natural_order)
+        self._files = _frame_files(path)
         if not self._files:
             raise BadInput(f'{path} holds no bag and no frames ({", ".join(FRAME_SUFFIXES)})')
         self._fps = fps or DEFAULT_FPS
