@@ -206,10 +206,15 @@ class Graph:
 
     def close(self) -> None:
         self.client.close()
-        for each in self._processes:
-            if each.process.poll() is None:
-                each.process.kill()
-                each.process.wait()
+        running = [p.process for p in self._processes if p.process.poll() is None]
+        for process in running:
+            process.terminate()
+        for process in running:
+            try:
+                process.wait(PATIENCE)
+            except subprocess.TimeoutExpired:
+                process.kill()  # leaves its shared memory behind
+                process.wait()
 
 
 @contextmanager

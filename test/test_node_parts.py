@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import threading
+import xml.etree.ElementTree as xml
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,12 @@ from sphstereo_ros.ros.matching import (
     frames_needed,
 )
 from sphstereo_ros.ros.monitor import ERROR, OK, STALL, WARN, Monitor
-from sphstereo_ros.ros.transport import PROFILE, prepare_process
+from sphstereo_ros.ros.transport import (
+    PROFILE,
+    SMALL_PROFILE,
+    prepare_process,
+    segment_size,
+)
 from sphstereo_ros.ros.worker import Worker
 
 DEADLINE = 10.0
@@ -305,21 +311,32 @@ def test_covariances_are_bounded() -> None:
 
 def test_profile_is_loaded_unless_the_user_chose_one() -> None:
     environment: dict[str, str] = {}
-    prepare_process(environment)
+    prepare_process(environment=environment)
     assert environment == {'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE)}
     for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_BUILTIN_TRANSPORTS'):
         chosen = {name: 'mine'}
-        prepare_process(chosen)
+        assert prepare_process(environment=chosen) == ''
         assert chosen == {name: 'mine'}
 
 
-def test_profile_holds_what_a_process_has_under_way() -> None:
-    import xml.etree.ElementTree as xml
-    tree = xml.fromstring(Path(PROFILE).read_text())
+def test_too_little_shared_memory_is_told(tmp_path: Path) -> None:
+    profile = tmp_path / 'huge.xml'
+    profile.write_text(f'<segment_size>{2**60}</segment_size>')
+    assert 'large messages travel by UDP' in prepare_process(profile, {})
 
-    def number(name: str) -> int:
-        return int(next(e.text for e in tree.iter() if e.tag.endswith(name)))
+
+def numbers(profile: Path) -> dict[str, int]:
+    tree = xml.fromstring(profile.read_text())
+    return {e.tag.rpartition('}')[2]: int(e.text) for e in tree.iter()
+            if e.text and e.text.strip().isdigit()}
+
+
+def test_profile_holds_what_a_process_has_under_way() -> None:
     pixels = 1920 * 960
     outputs = 3 * (4 * pixels + 4 * pixels + 8_000_000 + 3 * pixels) + 5 * 3 * pixels
-    assert number('segment_size') > outputs
-    assert number('port_queue_capacity') * 65500 >= outputs
+    found = numbers(PROFILE)
+    assert found['segment_size'] == segment_size(PROFILE) > outputs
+    assert found['port_queue_capacity'] * 65500 >= outputs
+    small = numbers(SMALL_PROFILE)
+    assert small['segment_size'] < found['segment_size'] / 4
+    assert small['port_queue_capacity'] == found['port_queue_capacity']

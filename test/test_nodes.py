@@ -13,16 +13,18 @@ import pytest
 pytest.importorskip('rclpy')
 
 import room
+from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
 from rclpy.qos import ReliabilityPolicy
 from ros_graph import Graph, drops, graph, mono8, nanoseconds, odometry, set_stamp
-from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CompressedImage, Image, Imu, PointCloud2
 
 from sphstereo_ros.core.chain import Chain, StageResults
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import Frame
 from sphstereo_ros.core.motion import OdometrySample
+from sphstereo_ros.nodes.frame_pairing import TransportChoice
 
 STEP, HEIGHT = 0.15, 240
 STAGES = ('frame_pairing', 'pose_stabilisation', 'motion_alignment', 'spherical_stereo')
@@ -144,10 +146,7 @@ def test_pipeline_on_compressed_images_without_a_baseline(ros: Graph) -> None:
         client.linked(f'/robot/{topic}')
     image = client.camera(CompressedImage, '/robot/image/compressed', 'pipeline: frame_pairing')
     for i, frame in enumerate(frames()):
-        message = CompressedImage(format='png')
-        message.data.frombytes(cv2.imencode('.png', frame.image)[1].tobytes())
-        set_stamp(message, frame.key.stamp, 'camera_optical')
-        image.publish(message)
+        image.publish(png(frame.key.stamp, frame.image))
         sent = client.stamped('/robot/frames', frame.key.stamp)
         np.testing.assert_array_equal(np.frombuffer(sent.data, np.uint8), frame.image.reshape(-1))
         if i:
@@ -229,6 +228,69 @@ def test_stages_name_what_is_wrong_with_windows(ros: Graph) -> None:
     for stamp in range(1, 7):
         pairs.publish(window(stamp, stamp + 1))
     client.dropped('pose_stabilisation', 'frame_missing', 2)
+
+
+def test_first_transport_that_delivers_is_kept() -> None:
+    choice = TransportChoice()
+    assert choice.accepts('image', 0.0)
+    assert not choice.accepts('image/compressed', 0.9)
+    assert choice.accepts('image', 0.95)
+    assert not choice.accepts('image/compressed', 1.9)
+    assert choice.accepts('image/compressed', 1.95)
+    assert not choice.accepts('image', 2.0)
+    choice.failed('image')
+    assert not choice.accepts('image', 2.0)
+    choice.failed('image/compressed')
+    assert choice.accepts('image', 2.0)
+
+
+def test_twist_and_imu_reach_the_pairing(ros: Graph) -> None:
+    """Half a second forward at 2 m/s; what the IMU says badly is named."""
+    client = ros.client
+    ros.start('frame_pairing', 'baseline.source:=twist')
+    client.subscribe(PathMessage, 'pairs')
+    client.linked('pairs')
+    motion, imu = client.publisher(TwistStamped, 'twist'), client.publisher(Imu, 'imu')
+    image = client.camera(Image, 'image', 'frame_pairing')
+    grey = np.zeros((8, 16), np.uint8)
+    for stamp in (10**9, 10**9 + 500_000_000):
+        twist = TwistStamped()
+        set_stamp(twist, stamp, 'base_link')
+        twist.twist.linear.x = 2.0
+        motion.publish(twist)
+        image.publish(mono8(stamp, grey))
+    position = client.stamped('pairs', 10**9 + 500_000_000).poses[0].pose.position
+    assert (position.x, position.y, position.z) == pytest.approx((0.0, 0.0, -1.0))
+    bad = Imu()
+    bad.angular_velocity_covariance[0] = -1.0
+    imu.publish(bad)
+    client.dropped('frame_pairing', 'imu_no_angular_velocity')
+
+
+def test_both_transports_of_one_camera_give_every_frame_once(ros: Graph) -> None:
+    client = ros.client
+    ros.start('frame_pairing')
+    client.subscribe(PathMessage, 'pairs')
+    client.linked('pairs')
+    raw = client.camera(Image, 'image', 'frame_pairing')
+    compressed = client.publisher(CompressedImage, 'image/compressed')
+    image = frames()[0].image
+    for stamp in range(1, 5):
+        raw.publish(mono8(stamp, image))
+        compressed.publish(png(stamp, image))
+        if stamp > 1:
+            client.stamped('pairs', stamp)
+    client.dropped('frame_pairing', 'other_transport')
+    assert len(client.received['pairs']) == 3
+    assert drops(client.statuses()['frame_pairing']).keys() == {
+        'first_frame', 'unknown_encoding', 'other_transport'}
+
+
+def png(stamp: int, image: np.ndarray) -> CompressedImage:
+    message = CompressedImage(format='png')
+    message.data.frombytes(cv2.imencode('.png', image)[1].tobytes())
+    set_stamp(message, stamp, 'camera_optical')
+    return message
 
 
 def window(reference: int, current: int) -> PathMessage:

@@ -9,6 +9,7 @@ from sphstereo_ros.ros.conversions import odometry_message, window_message
 from sphstereo_ros.ros.live_messages import make
 from sphstereo_ros.ros.shell import Shell, run
 from sphstereo_ros.ros.stage import StageComponent, pose_values
+from sphstereo_ros.ros.transport import SMALL_PROFILE
 
 
 def build(shell: Shell, then: Callable[[AlignedWindow, float], None] | None = None
@@ -28,4 +29,4 @@ def build(shell: Shell, then: Callable[[AlignedWindow, float], None] | None = No
 
 def main(args: list[str] | None = None) -> int:
     """Run the node `motion_alignment`; returns its exit status."""
-    return run('motion_alignment', lambda shell: [build(shell)], args)
+    return run('motion_alignment', lambda shell: [build(shell)], args, SMALL_PROFILE)

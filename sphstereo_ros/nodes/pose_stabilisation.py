@@ -9,6 +9,7 @@ from sphstereo_ros.ros.conversions import window_message
 from sphstereo_ros.ros.live_messages import make
 from sphstereo_ros.ros.shell import Shell, run
 from sphstereo_ros.ros.stage import StageComponent, pose_values
+from sphstereo_ros.ros.transport import SMALL_PROFILE
 
 
 def build(shell: Shell, then: Callable[[StabilisedWindow, float], None] | None = None
@@ -25,4 +26,4 @@ def build(shell: Shell, then: Callable[[StabilisedWindow, float], None] | None =
 
 def main(args: list[str] | None = None) -> int:
     """Run the node `pose_stabilisation`; returns its exit status."""
-    return run('pose_stabilisation', lambda shell: [build(shell)], args)
+    return run('pose_stabilisation', lambda shell: [build(shell)], args, SMALL_PROFILE)

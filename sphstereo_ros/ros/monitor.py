@@ -1,7 +1,6 @@
 """What a stage tells of itself in /diagnostics: rates, latency, drops by cause."""
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections import Counter, deque
@@ -19,13 +18,19 @@ EXPECTED = frozenset({'first_frame', 'other_transport'})
 STALL = 2.0
 
 
-def resident_megabytes() -> float:
-    """Resident memory of this process, NaN where the system does not tell."""
+def memory() -> dict[str, str]:
+    """Memory of this process: its own, and what it shares with others (messages under way)."""
+    kilobytes: dict[str, float] = {}
     try:
-        pages = int(Path('/proc/self/statm').read_text().split()[1])
-    except (OSError, IndexError, ValueError):
-        return float('nan')
-    return pages * os.sysconf('SC_PAGE_SIZE') / 1e6
+        for line in Path('/proc/self/status').read_text().splitlines():
+            if line.startswith('Rss'):
+                name, number, *_ = line.split()
+                kilobytes[name] = float(number)
+    except (OSError, ValueError):
+        return {}
+    own = kilobytes.get('RssAnon:', 0.0) + kilobytes.get('RssFile:', 0.0)
+    return {'memory_mb': f'{own * 1.024e-3:.1f}',
+            'shared_memory_mb': f'{kilobytes.get("RssShmem:", 0.0) * 1.024e-3:.1f}'}
 
 
 class Monitor:
@@ -95,7 +100,7 @@ class Monitor:
                 'rate_out': f'{(self._out - self._reported_out) / seconds:.2f}',
                 **self._latency(), 'drops': self._drops.total(),
                 **{f'drops.{cause}': n for cause, n in sorted(self._drops.items())},
-                'memory_mb': f'{resident_megabytes():.1f}', **self._values}
+                **memory(), **self._values}
             if self._last_drop is not None:
                 values['last_drop'] = f'{self._last_drop.cause}: {self._last_drop.detail}'
             self._reported = self._drops.copy()

@@ -6,6 +6,7 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
@@ -30,7 +31,7 @@ from sphstereo_ros.ros.conversions import diagnostic_message
 from sphstereo_ros.ros.live_messages import make, message_class
 from sphstereo_ros.ros.monitor import Monitor
 from sphstereo_ros.ros.parameters import NodeParameters, names_of
-from sphstereo_ros.ros.transport import prepare_process
+from sphstereo_ros.ros.transport import PROFILE, prepare_process
 from sphstereo_ros.ros.worker import Worker
 
 # What ROS raises where its own arguments or parameters are wrong.
@@ -193,19 +194,22 @@ def read_mask(path: str) -> Image8 | None:
 
 
 def run(name: str, build: Callable[[Shell], Sequence[Component]],
-        args: Sequence[str] | None = None) -> int:
+        args: Sequence[str] | None = None, profile: Path = PROFILE) -> int:
     """Start the node `name`, work until a signal ends it, and return its exit status.
 
     build : makes the node's components, in the order in which data passes them
+    profile : of the transport; PROFILE where the node sends large messages
     """
     words = list(sys.argv if args is None else args)
-    prepare_process()
+    warning = prepare_process(profile)
     shell = None
     try:
         stray = _init(words)
         if stray:
             return _usage(name, stray)
         shell = Shell(name, words)
+        if warning:
+            shell.log.warning(warning)
         _work(shell, build)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
