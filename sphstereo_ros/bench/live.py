@@ -1,0 +1,251 @@
+"""The live benchmark: the nodes as processes, frames through DDS at a given rate."""
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sphstereo_ros.core.frames import Drop
+from sphstereo_ros.replay.parameter_files import load_values
+from sphstereo_ros.replay.records import BadInput
+from sphstereo_ros.replay.sources import image_topic, open_source
+from sphstereo_ros.ros.conversions import decode_frame
+
+from .processes import CHAINS, Process, Processes, numbers, private_domain, shipped
+from .speed import to_and_fro
+
+DEPTH, CLOUD = '/depth/image', '/points'
+START_UP = 120.0  # seconds until the first depth
+SETTLE = 3.0
+RESTARTED = {'separate': ('pose_stabilisation', ('/pairs', '/frames')),
+             'pipeline': ('pipeline', ('/image', '/image/compressed'))}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `sphstereo bench live`, --json apart."""
+    parser.add_argument('--bag', type=Path, default=Path('bags/street.mcap'), metavar='IN',
+                        help='frames to send, forth and back (default: %(default)s)')
+    parser.add_argument('--height', type=int, default=480, help='rows of the frames sent')
+    parser.add_argument('--rate', type=float, default=30.0, metavar='HZ')
+    parser.add_argument('--seconds', type=float, default=30.0, help='to be measured')
+    parser.add_argument('--encoding', choices=('mono8', 'bgr8', 'jpeg'), default='mono8')
+    parser.add_argument('--chain', choices=tuple(CHAINS), default='separate',
+                        help='four processes, or one')
+    parser.add_argument('--params', type=Path, action='append', default=[], metavar='FILE',
+                        help='(default: config/live.yaml)')
+    parser.add_argument('-p', action='append', default=[], dest='overrides',
+                        metavar='NAME:=VALUE', help='parameter of the nodes')
+    parser.add_argument('--no-restart', action='store_true', help='kill no node at the end')
+
+
+def main(args: argparse.Namespace) -> int:
+    """Measure, print a table (and JSON); returns the exit status."""
+    try:
+        import rclpy  # noqa: F401
+    except ImportError as error:
+        raise BadInput(f'bench live needs ROS 2, and there is no {error.name}') from error
+    if args.height < 60 or not args.rate > 0 or not args.seconds >= 1:
+        raise BadInput('--height: at least 60; --rate: above 0; --seconds: at least 1')
+    files = args.params or [shipped('config/live.yaml')]
+    load_values(files, args.overrides)  # refused here rather than by each node
+    result = _run(args, node_arguments(files, args.overrides))
+    print(table(result))
+    if args.json:
+        print(json.dumps(result))
+    return 0
+
+
+def node_arguments(files: Sequence[Path], overrides: Sequence[str]) -> list[str]:
+    """ROS arguments of a node, with the sample's baseline unless another is given."""
+    words = [word for file in files for word in ('--params-file', str(file))]
+    given = [o.partition(':=')[0] for o in overrides]
+    if not any(name.startswith('baseline.') for name in given):
+        overrides = ['baseline.length:=0.28', *overrides]
+    return [*words, *(word for o in overrides for word in ('-p', o))]
+
+
+def frames(path: Path, height: int, colour: bool) -> NDArray[np.uint8]:
+    """All images of an input, (N, H, 2H) grey or (N, H, 2H, 3) BGR, forth and back."""
+    source = open_source(path)
+    read = []
+    for record in source.records([image_topic(source)]):
+        message = record.message()
+        frame = message if isinstance(message, Drop) else decode_frame(message, 0, colour)
+        if not isinstance(frame, Drop):
+            image = frame.image if frame.colour is None else frame.colour
+            read.append(cv2.resize(image, (2 * height, height), interpolation=cv2.INTER_AREA))
+    if len(read) < 2:
+        raise BadInput(f'{path}: less than two frames')
+    return np.stack(to_and_fro(read, 2 * len(read) - 2))
+
+
+@dataclass
+class Usage:
+    """Memory (MB) and CPU (seconds) of a process over time."""
+
+    seconds: list[float]
+    memory: list[float]
+    cpu: list[float]
+
+    def summary(self) -> dict[str, Any]:
+        """Memory at start and end, its growth in the second half, share of one core."""
+        half = len(self.seconds) // 2
+        span = self.seconds[-1] - self.seconds[half]
+        growth = float(np.polyfit(self.seconds[half:], self.memory[half:], 1)[0]) * 60 \
+            if span > 0 else math.nan
+        return {'memory_start_mb': round(self.memory[0], 1),
+                'memory_end_mb': round(self.memory[-1], 1),
+                'growth_mb_per_min': round(growth, 2) if math.isfinite(growth) else None,
+                'cpu_percent': round(100 * (self.cpu[-1] - self.cpu[0])
+                                     / max(self.seconds[-1] - self.seconds[0], 1e-3), 1)}
+
+
+def _run(args: argparse.Namespace, parameters: list[str]) -> dict[str, Any]:
+    from .observer import Observer
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        np.save(folder / 'frames.npy', frames(args.bag, args.height, args.encoding != 'mono8'))
+        private_domain()
+        with Processes(folder) as processes, Observer() as observer:
+            observer.watch(DEPTH, 'sensor_msgs/msg/Image')
+            observer.watch(CLOUD, 'sensor_msgs/msg/PointCloud2')
+            processes.start_chain(args.chain, parameters)
+            processes.start('camera', sys.executable, '-m', 'sphstereo_ros.bench.camera',
+                            str(folder / 'frames.npy'), '--rate', str(args.rate),
+                            '--encoding', args.encoding, '--sent', str(folder / 'sent.json'))
+            bench = LiveBench(observer, processes)
+            first = bench.start_up()
+            window, usage, drops = bench.measure(args.seconds)
+            restart = None if args.no_restart else bench.restart(args.chain, parameters)
+            processes.stop('camera')
+            sent = json.loads((folder / 'sent.json').read_text())
+            statuses = processes.stop(*processes.running)
+    return {'chain': args.chain, 'height': args.height, 'encoding': args.encoding,
+            'rate_wanted': args.rate, 'seconds': args.seconds,
+            **flow(sent, {t: observer.topics[t].arrivals for t in (DEPTH, CLOUD)}, window),
+            'stages': drops, 'processes': usage, 'first_depth_s': first, 'restart': restart,
+            'exit_statuses': statuses}
+
+
+class LiveBench:
+    """Measures a chain that runs."""
+
+    def __init__(self, observer: Any, processes: Processes) -> None:
+        self._observer = observer
+        self._processes = processes
+
+    def start_up(self) -> float:
+        """Wait for depth; returns how long it took from the start of the first process."""
+        started = min(p.started for p in self._processes.running.values())
+        depth = self._observer.topics[DEPTH].arrivals
+        ready = self._observer.until(lambda: depth or self._processes.ended(), START_UP)
+        ended = self._processes.ended()
+        if ended is not None:
+            raise RuntimeError(f'{ended.name} ended: {_last_lines(ended)}')
+        if not ready:
+            raise RuntimeError(f'no depth in {START_UP:g} s; {dict(self._observer.totals())}')
+        first = round(float(depth[0][1]) / 1e9 - started, 2)
+        self._observer.spin(SETTLE)
+        return first
+
+    def measure(self, seconds: float) -> tuple[tuple[int, int], dict[str, Any], dict[str, Any]]:
+        """Window of monotonic time (ns), use of the machine by process, counts by stage."""
+        from .observer import since
+        before = self._observer.totals()
+        used = {name: Usage([], [], []) for name in self._processes.running}
+        start = time.monotonic_ns()
+        while True:
+            passed = (time.monotonic_ns() - start) / 1e9
+            for name, usage in used.items():
+                memory, cpu = self._processes.running[name].usage()
+                usage.seconds.append(passed)
+                usage.memory.append(memory)
+                usage.cpu.append(cpu)
+            if passed >= seconds:
+                break
+            self._observer.spin(min(1.0, seconds - passed))
+        window = start, time.monotonic_ns()
+        return (window, {name: usage.summary() for name, usage in used.items()},
+                since(before, self._observer.totals()))
+
+    def restart(self, chain: str, parameters: list[str]) -> dict[str, Any]:
+        """Kill a node, start it again, and wait for depth."""
+        name, topics = RESTARTED[chain]
+        known = {topic: self._observer.subscriptions(topic, name) for topic in topics}
+        self._processes.kill(name)
+        self._observer.spin(1.0)
+        process = self._processes.start(name, '--ros-args', *parameters)
+
+        def matched() -> bool:
+            return all(self._observer.subscriptions(topic, name) - known[topic]
+                       for topic in topics)
+        if not self._observer.until(matched, START_UP):
+            raise RuntimeError(f'{name} did not come back: {_last_lines(process)}')
+        subscribed = time.monotonic_ns()
+        depth = self._observer.topics[DEPTH].arrivals
+        so_far = len(depth)
+        if not self._observer.until(lambda: len(depth) > so_far, START_UP):
+            raise RuntimeError(f'no depth after {name} was restarted')
+        return {'node': name,
+                'start_to_subscribed_s': round(subscribed / 1e9 - process.started, 2),
+                'subscribed_to_depth_s': round((depth[so_far][1] - subscribed) / 1e9, 2)}
+
+
+def _last_lines(process: Process) -> str:
+    return ' / '.join(process.log.read_text(errors='replace').splitlines()[-3:])
+
+
+def flow(sent: Sequence[int], arrivals: dict[str, list[tuple[int, int]]],
+         window: tuple[int, int]) -> dict[str, Any]:
+    """Rates and latencies of what was sent and arrived within a window of time (ns)."""
+    begin, end = window
+    seconds = (end - begin) / 1e9
+    inside = [stamp for stamp in sent if begin <= stamp < end]
+    out: dict[str, Any] = {'sent': len(inside), 'rate_in': round(len(inside) / seconds, 2)}
+    for topic, name in ((DEPTH, 'depth'), (CLOUD, 'cloud')):
+        there = [(stamp, at) for stamp, at in arrivals[topic] if begin <= at < end]
+        latency = numbers([(at - stamp) / 1e6 for stamp, at in there])
+        out |= {f'{name}_out': len(there), f'rate_{name}': round(len(there) / seconds, 2),
+                f'{name}_latency_ms': latency}
+    return out
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result for people."""
+    lines = [f'{result["chain"]}: {2 * result["height"]}×{result["height"]} {result["encoding"]}, '
+             f'{result["rate_wanted"]:g} Hz wanted, {result["seconds"]:g} s',
+             f'sent          {result["sent"]:6}  {result["rate_in"]:6.1f} Hz']
+    for name in ('depth', 'cloud'):
+        latency = result[f'{name}_latency_ms']
+        lines.append(f'{name:12}  {result[f"{name}_out"]:6}  {result[f"rate_{name}"]:6.1f} Hz   '
+                     f'stamp → arrival p50 {latency["p50"]} ms, p95 {latency["p95"]} ms')
+    lines.append('drops of the stages')
+    for part, counts in result['stages'].items():
+        dropped = [f'{n} {cause}' for cause, n in counts.items()
+                   if n and cause not in ('frames_in', 'frames_out')]
+        lines.append(f'  {part:34}{counts.get("frames_in", 0):6} in'
+                     f'{counts.get("frames_out", 0):7} out   {", ".join(dropped) or "none"}')
+    lines.append('processes')
+    for name, usage in result['processes'].items():
+        lines.append(f'  {name:34}{usage["memory_start_mb"]:8.1f} →{usage["memory_end_mb"]:7.1f}'
+                     f' MB ({usage["growth_mb_per_min"]} MB/min)  {usage["cpu_percent"]:.0f} % CPU')
+    lines.append(f'first depth {result["first_depth_s"]} s after the start')
+    if result['restart']:
+        back = result['restart']
+        lines.append(f'{back["node"]} killed and restarted: subscribed after '
+                     f'{back["start_to_subscribed_s"]} s, depth {back["subscribed_to_depth_s"]} s '
+                     'later')
+    if any(result['exit_statuses'].values()):
+        lines.append(f'exit statuses: {result["exit_statuses"]}')
+    return '\n'.join(lines)
