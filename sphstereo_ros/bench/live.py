@@ -238,8 +238,9 @@ def table(result: dict[str, Any]) -> str:
                      f'{counts.get("frames_out", 0):7} out   {", ".join(dropped) or "none"}')
     lines.append('processes')
     for name, usage in result['processes'].items():
-        lines.append(f'  {name:34}{usage["memory_start_mb"]:8.1f} →{usage["memory_end_mb"]:7.1f}'
-                     f' MB ({usage["growth_mb_per_min"]} MB/min)  {usage["cpu_percent"]:.0f} % CPU')
+        start, end = usage['memory_start_mb'], usage['memory_end_mb']
+        lines.append(f'  {name:34}{start:8.1f} →{end:7.1f} MB'
+                     f' ({usage["growth_mb_per_min"]} MB/min)  {usage["cpu_percent"]:.0f} % CPU')
     lines.append(f'first depth {result["first_depth_s"]} s after the start')
     if result['restart']:
         back = result['restart']

@@ -19,8 +19,8 @@ from sphstereo_ros.ros.messages import nanoseconds
 Window = TypeVar('Window', bound=FrameWindow)
 
 MAX_PENDING = 4
-# Frames in flight while a window is on its way.
-SPARE_FRAMES = 8
+# Frames that come while a window is on its way: a second of 30 Hz, longer than a slow chain takes.
+SPARE_FRAMES = 30
 
 
 def frames_needed(config: Config) -> int:
