@@ -174,6 +174,15 @@ def test_every_node_ends_cleanly(ros: Graph, number: int) -> None:
     ros.client.until(lambda: ros.client.node.count_publishers('/diagnostics') == 0, 'all to leave')
 
 
+def test_a_signal_during_the_warm_up_is_no_failure(ros: Graph, tmp_path: Path) -> None:
+    ros.environment['NUMBA_CACHE_DIR'] = str(tmp_path)
+    process = ros.start('pipeline')
+    ros.client.linked('/diagnostics', 1)
+    assert process.stop(signal.SIGTERM) == 0, process.log
+    assert 'ready' not in process.log
+    assert 'Traceback' not in process.log
+
+
 def test_bad_input_is_a_named_drop_and_the_node_lives(ros: Graph) -> None:
     client = ros.client
     process = ros.start('pipeline', 'baseline.length:=0.15', 'stereo.matcher:=bm')

@@ -157,10 +157,6 @@ class Shell:
         try:
             while rclpy.ok():
                 executor.spin_once(timeout_sec=1.0)
-        except Exception:
-            # The context may end in the midst of a callback, which then cannot publish.
-            if rclpy.ok():
-                raise
         finally:
             executor.remove_node(self.node)
 
@@ -215,6 +211,10 @@ def run(name: str, build: Callable[[Shell], Sequence[Component]],
         pass
     except (ParameterError, *BAD_ARGUMENTS) as error:
         return _refuse(name, str(error).splitlines()[0])
+    except Exception:
+        # A signal may end the context in the midst of anything, which then fails.
+        if rclpy.ok():
+            raise
     finally:
         # A launch system may send SIGINT twice.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -237,6 +237,8 @@ def _work(shell: Shell, build: Callable[[Shell], Sequence[Component]]) -> None:
     components = build(shell)
     for component in reversed(components):
         component.warm_up()
+        if not rclpy.ok():
+            return
     for component in reversed(components):
         component.subscribe()
 
