@@ -262,8 +262,8 @@ def test_any_order_of_arrival_gives_the_same_windows(order: list[int]) -> None:
 
 
 def test_frames_needed_follow_the_pairing() -> None:
-    assert frames_needed(resolve({'pairing.intervals': (4, 10)})) == 18
-    assert frames_needed(resolve({'pairing.baselines': (1.0,), 'baseline.length': 0.3})) == 108
+    assert frames_needed(resolve({'pairing.intervals': (4, 10)})) == 40
+    assert frames_needed(resolve({'pairing.baselines': (1.0,), 'baseline.length': 0.3})) == 130
 
 
 # Covariances by visual odometry
