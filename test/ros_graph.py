@@ -36,12 +36,11 @@ def environment() -> dict[str, str]:
 class NodeProcess:
     """One of the package's nodes in a process of its own."""
 
-    def __init__(self, name: str, environment: dict[str, str], log: Path, *words: str) -> None:
-        self.name = name
+    def __init__(self, code: str, environment: dict[str, str], log: Path, *words: str) -> None:
         self._log = log
         with log.open('w') as file:
             self.process = subprocess.Popen(
-                [sys.executable, '-c', START.format(name), *words],
+                [sys.executable, '-c', code, *words],
                 env={**os.environ, **environment}, stdout=file, stderr=subprocess.STDOUT)
 
     @property
@@ -194,12 +193,15 @@ class Graph:
         os.environ.update(self.environment)
         self.client = Client(int(self.environment['ROS_DOMAIN_ID']))
 
-    def start(self, name: str, *words: str) -> NodeProcess:
-        """Start a node with parameters `name:=value`, or other words of the command line."""
+    def start(self, name: str, *words: str, code: str = '') -> NodeProcess:
+        """Start a node with parameters `name:=value`, or other words of the command line.
+
+        code : Python to run in place of the node of that name
+        """
         extra = [w for word in words for w in (('-p', word) if ':=' in word and '-' not in word[:1]
                                                else word.split(' '))]
         log = self._folder / f'{name}_{len(self._processes)}.log'
-        process = NodeProcess(name, self.environment, log,
+        process = NodeProcess(code or START.format(name), self.environment, log,
                               *(['--ros-args', *extra] if extra else []))
         self._processes.append(process)
         return process

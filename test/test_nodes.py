@@ -16,6 +16,8 @@ import room
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from nav_msgs.msg import Path as PathMessage
+from rcl_interfaces.srv import SetParametersAtomically
+from rclpy.parameter import Parameter
 from rclpy.qos import ReliabilityPolicy
 from ros_graph import Graph, drops, graph, mono8, nanoseconds, odometry, set_stamp
 from sensor_msgs.msg import CompressedImage, Image, Imu, PointCloud2
@@ -222,6 +224,60 @@ def test_bad_input_is_a_named_drop_and_the_node_lives(ros: Graph) -> None:
         client.dropped('pipeline: frame_pairing', cause)
     assert process.process.poll() is None
     assert 'internal_error' not in process.log
+
+
+FAILING = """
+import sys
+from sphstereo_ros.core.frames import PairedWindow
+from sphstereo_ros.ros.shell import run
+from sphstereo_ros.ros.stage import StageComponent
+
+class Stage:
+    def warm_up(self):
+        pass
+    def process(self, window):
+        raise ValueError('no such luck')
+
+sys.argv[0] = 'node'
+sys.exit(run('pose_stabilisation', lambda shell: [StageComponent(
+    shell, 'pose_stabilisation', PairedWindow, 'pairs', lambda config, mask: Stage(), None)]))
+"""
+
+
+def test_an_exception_is_counted_and_ends_nothing(ros: Graph) -> None:
+    client = ros.client
+    process = ros.start('pose_stabilisation', code=FAILING)
+    image, pairs = client.publisher(Image, 'frames'), client.publisher(PathMessage, 'pairs')
+    for stamp in range(1, 4):
+        image.publish(mono8(stamp, np.zeros((8, 16), np.uint8)))
+        if stamp > 1:
+            pairs.publish(window(stamp - 1, stamp))
+            client.dropped('pose_stabilisation', 'internal_error', stamp - 1)
+    levels = [s.level for m in client.received['/diagnostics'] for s in m.status]
+    assert b'\x02' in levels
+    assert process.log.count('ValueError: no such luck') == 2  # the traceback, the named drop
+    assert process.log.count('Traceback') == 1
+    assert process.stop() == 0
+
+
+def test_a_running_stage_takes_new_parameters(ros: Graph) -> None:
+    """The same frames, before and after one more matcher was asked for."""
+    client = ros.client
+    ros.start('pipeline', 'stereo.matcher:=bm')
+    client.subscribe(Image, 'depth/relative')
+    client.linked('depth/relative')
+    image = client.camera(Image, 'image', 'pipeline: frame_pairing')
+    for frame in frames()[:2]:
+        image.publish(mono8(frame.key.stamp, frame.image))
+    client.stamped('depth/relative', frames()[1].key.stamp)
+    matcher = Parameter('stereo.matcher', value='sgbm').to_parameter_msg()
+    answer = client.call(SetParametersAtomically, '/pipeline/set_parameters_atomically',
+                         SetParametersAtomically.Request(parameters=[matcher]))
+    assert answer.result.successful
+    image.publish(mono8(frames()[2].key.stamp, frames()[2].image))
+    depth = client.stamped('depth/relative', frames()[2].key.stamp)
+    expected = truth('fixed', 'sgbm')[frames()[2].key.stamp].range_image.range
+    np.testing.assert_allclose(floats(depth), expected, rtol=1e-5)
 
 
 def test_stages_name_what_is_wrong_with_windows(ros: Graph) -> None:

@@ -27,6 +27,9 @@ from sphstereo_ros.ros.parameters import (
 )
 from sphstereo_ros.ros.shell import read_mask
 
+PLAIN = ('import sys; from sphstereo_ros.nodes.frame_pairing import main; '
+         'sys.exit(main(["node", "{}"]))')
+
 
 @pytest.fixture
 def ros(tmp_path: Path) -> Iterator[Graph]:
@@ -222,6 +225,15 @@ def test_the_command_line_wins_over_files(ros: Graph, tmp_path: Path,
         image.publish(mono8(stamp, np.zeros((8, 16), np.uint8)))
     assert ros.client.stamped('pairs', 2).poses[0].pose.position.z == -0.5
     assert process.stop() == 0
+
+
+def test_help_and_stray_words(ros: Graph) -> None:
+    asked, stray = ros.start('frame_pairing', code=PLAIN.format('--help')), ros.start(
+        'frame_pairing', code=PLAIN.format('word'))
+    assert asked.ended() == 0
+    assert asked.log.startswith('usage: frame_pairing ')
+    assert stray.ended() == 2
+    assert stray.log.startswith('frame_pairing: word: unknown argument\nusage: ')
 
 
 def test_documentation_table_has_every_parameter() -> None:
