@@ -60,7 +60,7 @@ def theta2(axes: np.ndarray) -> np.ndarray:
     return np.arccos(np.clip(BEARINGS @ axes[:, 2], -1, 1))
 
 
-@given(st.integers(0, 2**32 - 1), st.floats(0.05, 1.5))
+@given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.8))
 @settings(deadline=None, max_examples=30)
 def test_range_comes_back_on_the_cameras_own_grid(seed, baseline):
     direction = unit(np.random.default_rng(seed).normal(size=3))
@@ -71,8 +71,8 @@ def test_range_comes_back_on_the_cameras_own_grid(seed, baseline):
     assert got.signed
     error = np.abs(surface(BEARINGS) * got.rho - 1)
     theta = theta2(axes)
-    assert np.median(error) < 1e-3
-    assert error[np.sin(theta) > 0.2].max() < 0.02  # one bilinear look-up of a curved surface
+    assert np.median(error) < 2e-4
+    assert error[np.sin(theta) > 0.3].max() < 1.5e-3  # one bilinear look-up of a curved surface
 
 
 @pytest.mark.parametrize('direction', [(0, 0, 1), (1, 0, 0), (0, -1, 0), (-0.5, 0.5, -0.7)])
@@ -80,9 +80,9 @@ def test_seam_and_poles_of_the_image_are_like_the_rest(direction):
     axes = polar_axes(direction)
     got = inverse_range(exact_parallax(axes, 0.3), GRID, axes, pose_along(direction, 0.3), HEIGHT)
     error = np.abs(surface(BEARINGS) * got.rho - 1)
-    error[np.sin(theta2(axes)) < 0.2] = 0
+    error[np.sin(theta2(axes)) < 0.3] = 0
     for edge in (error[:, :2], error[:, -2:], error[:2], error[-2:]):
-        assert edge.max() < 0.02
+        assert edge.max() < 1.5e-3
 
 
 def test_what_is_unknown_has_no_weight():

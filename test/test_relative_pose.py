@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,7 +18,7 @@ from two_views import (
 from sphstereo_ros.core import rotations
 from sphstereo_ros.core.config import PoseConfig
 from sphstereo_ros.core.five_point import decompose
-from sphstereo_ros.core.frames import Drop
+from sphstereo_ros.core.frames import Drop, RelativePose
 from sphstereo_ros.core.relative_pose import (
     Correspondences,
     PoseEstimate,
@@ -28,7 +30,7 @@ from sphstereo_ros.core.relative_pose import (
     rotation_between,
     tangent,
 )
-from sphstereo_ros.core.stabilisation import estimate
+from sphstereo_ros.core.stabilisation import estimate, with_length
 
 seeds = st.integers(0, 2**32 - 1)
 THRESHOLD = 0.003
@@ -209,6 +211,24 @@ def test_covariance_of_six_has_no_share_along_the_direction():
                                atol=1e-15)
     np.testing.assert_allclose(pose.covariance6[:3, :3], pose.covariance[:3, :3])
     assert np.trace(pose.covariance6) == pytest.approx(np.trace(pose.covariance))
+
+
+@pytest.mark.parametrize('length', [1.0, 0.1, 20.0])
+def test_the_estimate_takes_the_length_of_the_prior(length):
+    """The position and its covariance grow with the length; the direction's angle does not."""
+    _, (pose, *_) = monte_carlo('oblique', trials=1)
+    prior = RelativePose(np.eye(3), np.array([0, 0, -length]))
+    got = with_length(pose, prior)
+    np.testing.assert_allclose(got.position, length * pose.direction)
+    np.testing.assert_array_equal(got.rotation, pose.rotation)
+    scale = np.repeat([1.0, length], 3)
+    np.testing.assert_allclose(got.covariance, pose.covariance6 * np.outer(scale, scale))
+    # The prior's uncertainty of the length, not of its direction, comes on top.
+    sure = replace(prior, covariance=np.diag([1.0] * 5 + [0.0]))
+    np.testing.assert_allclose(with_length(pose, sure).covariance, got.covariance)
+    unsure = with_length(pose, replace(prior, covariance=np.diag([0.0] * 5 + [0.04])))
+    np.testing.assert_allclose(unsure.covariance[3:, 3:] - got.covariance[3:, 3:],
+                               0.04 * np.outer(pose.direction, pose.direction), atol=1e-12)
 
 
 def far_views(rng: np.random.Generator, rotation: np.ndarray, noise: float) -> Correspondences:
