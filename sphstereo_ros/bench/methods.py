@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 METHODS: dict[str, Mapping[str, object]] = {
     'default': {},
+    'flow': {'stereo.matcher': 'flow'},
     'flow_fast': {'stereo.matcher': 'flow_fast'},
     'bm': {'stereo.matcher': 'bm'},
     'sgbm': {'stereo.matcher': 'sgbm'},

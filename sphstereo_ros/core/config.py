@@ -164,12 +164,13 @@ class AlignmentConfig:
 class StereoConfig:
     """Matching along the meridians (stage 4)."""
 
-    matcher: str = _p('stereo.matcher', 'flow', 'flow, flow_fast: dense flow with checks; '
-                      'bm, sgbm: as in OpenCV', choices=('flow', 'flow_fast', 'bm', 'sgbm'))
-    num_disparities: int = _p('stereo.num_disparities', 96, 'search range of bm and sgbm',
+    matcher: str = _p('stereo.matcher', 'hybrid', 'flow, flow_fast: dense flow with checks; '
+                      'bm, sgbm: as in OpenCV; hybrid: flow averaged with bm',
+                      choices=('hybrid', 'flow', 'flow_fast', 'bm', 'sgbm'))
+    num_disparities: int = _p('stereo.num_disparities', 96, 'search range of bm, sgbm and hybrid',
                               unit='px', low=16, high=1024)
-    block_size: int = _p('stereo.block_size', 15, 'odd window of bm and sgbm', unit='px', low=3,
-                         high=51)
+    block_size: int = _p('stereo.block_size', 15, 'odd window of bm, sgbm and hybrid',
+                         unit='px', low=3, high=51)
     working_height: int = _p('stereo.working_height', 0, 'height of frames and depth; 0 = input',
                              unit='px', low=0, high=8192, runtime=False)
 
@@ -208,8 +209,10 @@ class ReplayConfig:
                     runtime=False)
     start_offset: float = _p('replay.start_offset', 0.0, 'how much of the beginning to leave out',
                              unit='s', low=0.0, high=1e6, runtime=False)
-    wait: float = _p('replay.wait', 0.0, 'longest wait for a subscription before the start',
+    wait: float = _p('replay.wait', 0.0, 'longest wait for subscriptions before the start',
                      unit='s', low=0.0, high=3600.0, runtime=False)
+    subscriptions: int = _p('replay.subscriptions', 1, 'how many subscriptions to images to wait '
+                            'for', low=1, high=1000, runtime=False)
 
 
 @dataclass(frozen=True)

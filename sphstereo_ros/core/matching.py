@@ -45,6 +45,8 @@ _FLOOR = 0.04
 _NOISE = 1.2
 _FORTH_AND_BACK = 0.5
 
+_LOOP, _ACROSS = 1.5, 1.0  # px, in which a flow is consistent
+
 
 def structure(image: Image8, window: int = 9) -> Pixels:
     """Root mean square of the gradient along θ in a window, grey levels per pixel, at half size.
@@ -75,13 +77,16 @@ def inverse_search(preset: str, finest_scale: int) -> Any:
     return search
 
 
-def flow_matcher(preset: str, finest_scale: int) -> Matcher:
+def flow_matcher(preset: str, finest_scale: int, smoothness: float = 20.0) -> Matcher:
     """Dense inverse search flow, kept where it is consistent.
 
-    A match stands if the flow back from the reference returns to within a pixel, and if it stays
-    on its meridian.
+    A match stands if the flow back from the reference returns to within 1.5 pixels, and if it
+    stays within one pixel of its meridian.
+
+    smoothness : weight of smoothness in the variational refinement
     """
     search = inverse_search(preset, finest_scale)
+    search.setVariationalRefinementAlpha(smoothness)
 
     def match(current: Image8, reference: Image8) -> Parallax:
         there = search.calc(current, reference, None)
@@ -89,12 +94,35 @@ def flow_matcher(preset: str, finest_scale: int) -> Matcher:
         loop = _forth_and_back(there, back)
         along, across = there[..., 0], there[..., 1]
         half = cv2.resize(loop, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        sigma = _length(gradient_sigma(current), _FORTH_AND_BACK * half)
+        sigma = cv2.magnitude(gradient_sigma(current), _FORTH_AND_BACK * half)
         pixels = -along
-        pixels[(loop > 1) | (np.abs(across) > 1)] = UNKNOWN
+        pixels[(loop > _LOOP) | (np.abs(across) > _ACROSS)] = UNKNOWN
         return Parallax(pixels, sigma, signed=True)
 
     return match
+
+
+def hybrid_matcher(flow: Matcher, block: Matcher) -> Matcher:
+    """Dense flow, averaged with block matching where both agree to a pixel.
+
+    Their errors have little in common (smoothness here, windows there), so the mean is better than
+    either. What the flow does not know stays unknown.
+    """
+    def match(current: Image8, reference: Image8) -> Parallax:
+        matched, checked = flow(current, reference), block(current, reference)
+        rows_in_parallel(_average, len(current), matched.pixels, checked.pixels)
+        return matched
+
+    return match
+
+
+@kernel
+def _average(first: int, last: int, pixels: Pixels,
+             others: Pixels) -> None:  # pragma: no cover - compiled
+    for i in range(first, last):
+        for j in range(pixels.shape[1]):
+            if abs(pixels[i, j] - others[i, j]) < 1 and pixels[i, j] != UNKNOWN:
+                pixels[i, j] = np.float32(0.5) * (pixels[i, j] + others[i, j])
 
 
 def _forth_and_back(there: Pixels, back: Pixels) -> Pixels:
@@ -156,8 +184,12 @@ def semi_global_matcher(disparities: int, block: int) -> Matcher:
 
 def matcher(config: StereoConfig) -> Matcher:
     """The matcher that `config` names."""
+    block = block_matcher(config.num_disparities, config.block_size)
     if config.matcher == 'bm':
-        return block_matcher(config.num_disparities, config.block_size)
+        return block
     if config.matcher == 'sgbm':
         return semi_global_matcher(config.num_disparities, min(config.block_size, 7))
-    return flow_matcher('fast', 1) if config.matcher == 'flow' else flow_matcher('ultrafast', 2)
+    if config.matcher == 'flow_fast':
+        return flow_matcher('ultrafast', 2)
+    flow = flow_matcher('fast', 1, smoothness=40.0)
+    return hybrid_matcher(flow, block) if config.matcher == 'hybrid' else flow

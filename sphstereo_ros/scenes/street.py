@@ -11,8 +11,8 @@ from .builder import Builder
 from .scene import Light, Scene
 
 _FROM, _TO = -75.0, 135.0  # extent along the street, m
-_KERB = 4.0                # half the road's width
-_PAVEMENT = 7.2            # outer edge of the pavements
+_KERB = 4.5                # half the road's width
+_PAVEMENT = 10.5           # outer edge of the pavements
 _HEIGHT = 0.12             # of the pavements
 
 
@@ -124,7 +124,7 @@ def _furniture(build: Builder, side: int) -> None:
     y = side * (_KERB + 0.6)
     small, large = surfaces.foliage(rng), surfaces.foliage(rng)
     start = _FROM + float(rng.uniform(0, 12))
-    for k, x in enumerate(np.arange(start, _TO, 11.5) + rng.uniform(-1.5, 1.5)):
+    for k, x in enumerate(np.arange(start, _TO, 16.0) + rng.uniform(-1.5, 1.5)):
         if rng.random() < 0.25:
             continue
         leaf, count, kind = ((0.085, 13000, small), (0.15, 5500, large))[k % 2]

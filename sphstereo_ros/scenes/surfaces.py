@@ -10,7 +10,7 @@ from .material import Colour, Material
 ASPHALT = Material(colour=(0.105, 0.105, 0.11), stain_colour=(0.075, 0.075, 0.08), stain=0.8,
                    stain_size=3.0, grain=0.15, grain_size=0.025, grain_gain=1.0, crack=0.012,
                    crack_size=2.0, specular=0.02, exponent=12.0)
-SMOOTH_ASPHALT = replace(ASPHALT, stain=0.35, grain=0.035, stain_size=6.0, crack=0.0,
+SMOOTH_ASPHALT = replace(ASPHALT, stain=0.35, grain=0.06, stain_size=6.0, crack=0.0,
                          specular=0.03)
 PATCH = replace(ASPHALT, colour=(0.07, 0.07, 0.072), grain=0.1)
 PAINT = Material(colour=(0.62, 0.62, 0.6), stain_colour=(0.25, 0.25, 0.25), stain=0.8,
@@ -75,14 +75,14 @@ def plain_plaster(rng: np.random.Generator) -> Material:
     """Fresh paint: next to no texture."""
     colour = _pick(rng, _PLASTERS)
     return seeded(Material(colour=colour, stain_colour=_darker(colour, 0.94), stain=0.6,
-                           stain_size=3.0, grain=0.006, grain_size=0.05, dirt=0.25), rng)
+                           stain_size=3.0, grain=0.012, grain_size=0.1, dirt=0.25), rng)
 
 
 def old_plaster(rng: np.random.Generator) -> Material:
     """Rough render with stains."""
     colour = _pick(rng, _PLASTERS)
     return seeded(Material(colour=colour, stain_colour=_darker(colour, 0.6), stain=0.9,
-                           stain_size=1.6, grain=0.09, grain_size=0.2, grain_gain=0.7,
+                           stain_size=1.6, grain=0.16, grain_size=0.2, grain_gain=0.8,
                            stretch=(1.0, 1.0, 1.8), crack=0.006, crack_size=1.2, dirt=0.5), rng)
 
 
@@ -97,8 +97,8 @@ def brick(rng: np.random.Generator) -> Material:
 
 
 def wall(rng: np.random.Generator) -> Material:
-    """One of the wall materials; the plain one every other time."""
-    return (plain_plaster, plain_plaster, old_plaster, brick)[rng.integers(4)](rng)
+    """One of the wall materials; the plain one every fifth time."""
+    return (plain_plaster, old_plaster, old_plaster, brick, brick)[rng.integers(5)](rng)
 
 
 def car_paint(rng: np.random.Generator) -> Material:
