@@ -152,7 +152,7 @@ class LiveBench:
         ready = self._observer.until(lambda: depth or self._processes.ended(), START_UP)
         ended = self._processes.ended()
         if ended is not None:
-            raise RuntimeError(f'{ended.name} ended: {_last_lines(ended)}')
+            raise RuntimeError(f'{ended.name} ended: {last_lines(ended)}')
         if not ready:
             raise RuntimeError(f'no depth in {START_UP:g} s; {dict(self._observer.totals())}')
         first = round(float(depth[0][1]) / 1e9 - started, 2)
@@ -191,7 +191,7 @@ class LiveBench:
             return all(self._observer.subscriptions(topic, name) - known[topic]
                        for topic in topics)
         if not self._observer.until(matched, START_UP):
-            raise RuntimeError(f'{name} did not come back: {_last_lines(process)}')
+            raise RuntimeError(f'{name} did not come back: {last_lines(process)}')
         subscribed = time.monotonic_ns()
         depth = self._observer.topics[DEPTH].arrivals
         so_far = len(depth)
@@ -202,7 +202,8 @@ class LiveBench:
                 'subscribed_to_depth_s': round((depth[so_far][1] - subscribed) / 1e9, 2)}
 
 
-def _last_lines(process: Process) -> str:
+def last_lines(process: Process) -> str:
+    """What a process wrote last, for a message."""
     return ' / '.join(process.log.read_text(errors='replace').splitlines()[-3:])
 
 

@@ -16,7 +16,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--loop', action='store_true', help='begin again at the end')
     parser.add_argument('--start', type=float, default=0.0, help='seconds to leave out')
     parser.add_argument('--wait', type=float, default=0.0, metavar='SECONDS',
-                        help='longest wait for a subscription before the start')
+                        help='longest wait for subscriptions before the start')
+    parser.add_argument('--subscriptions', type=int, default=1, metavar='N',
+                        help='how many subscriptions to images to wait for (default: 1)')
     parser.add_argument('--topic', default='', help='image topic, if it is not the usual one')
 
 
@@ -24,7 +26,8 @@ def node_arguments(arguments: argparse.Namespace) -> list[str]:
     """Arguments of the node that do the same."""
     values: dict[str, object] = {
         'bag': str(arguments.input), 'topic': arguments.topic, 'rate': arguments.rate,
-        'loop': arguments.loop, 'start_offset': arguments.start, 'wait': arguments.wait}
+        'loop': arguments.loop, 'start_offset': arguments.start, 'wait': arguments.wait,
+        'subscriptions': arguments.subscriptions}
     words = ['bag_replay', '--ros-args']
     for name, value in values.items():
         # A YAML parser reads the value; JSON is YAML.

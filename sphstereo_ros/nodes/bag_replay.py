@@ -84,7 +84,7 @@ class BagReplay:
         end = time.monotonic() + self._config.wait
         images = [p for name, p in self._publishers.items() if 'image' in name]
         while rclpy.ok() and time.monotonic() < end:
-            if any(p.get_subscription_count() for p in images):
+            if any(p.get_subscription_count() >= self._config.subscriptions for p in images):
                 time.sleep(SETTLING)
                 return
             time.sleep(0.02)
