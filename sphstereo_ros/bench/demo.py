@@ -127,7 +127,6 @@ def _once(observer: Any, processes: Processes, say: Progress, frames: int) -> tu
     depth = observer.topics[DEPTH].arrivals
     replay = processes.running['sphstereo']
     shown = 0
-    begin = time.monotonic_ns()
     while replay.status is None:
         observer.spin(0.2)
         if len(depth) >= shown + 5:
@@ -138,7 +137,8 @@ def _once(observer: Any, processes: Processes, say: Progress, frames: int) -> tu
     del processes.running['sphstereo']
     clouds = observer.topics[CLOUD].arrivals
     observer.until(lambda: min(len(depth), len(clouds)) >= frames - 1, LAST_RESULT)
-    return begin, time.monotonic_ns()
+    images = observer.topics[IMAGE].arrivals
+    return images[0][1] if images else 0, time.monotonic_ns()
 
 
 def _loop(observer: Any, processes: Processes, seconds: float) -> tuple[int, int]:
