@@ -8,7 +8,15 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from .sequence import NO_NOISE, NOISE, SCENES, TUNING_SEEDS, render_sequence, save_sequence
+from .sequence import (
+    NO_NOISE,
+    NOISE,
+    SCENES,
+    TUNING_SEEDS,
+    load_sequence,
+    render_sequence,
+    save_sequence,
+)
 
 # The sample bag's content: a scene that is neither tuned on nor reported.
 SAMPLE_SEED = 42
@@ -36,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--no-noise', action='store_true', help='no image noise')
     parser.add_argument('--jpeg', type=int, default=92, metavar='QUALITY',
                         help='0 writes PNG files (default: %(default)s)')
+    parser.add_argument('--bag', type=Path, metavar='OUT.mcap', help='also write a bag of it')
     parser.add_argument('--mount', type=float, nargs=3, default=(0.0, 0.0, 0.0),
                         metavar=('ROLL', 'PITCH', 'YAW'), help='of the camera, radians')
 
@@ -51,6 +60,9 @@ def main(args: argparse.Namespace) -> int:
         args.exposure, NO_NOISE if args.no_noise else NOISE, args.jpeg or None,
         tuple(args.mount))
     save_sequence(sequence, args.folder, args.name, progress=_bar(len(sequence)))
+    if args.bag is not None:
+        from .bag import write_bag
+        write_bag(load_sequence(args.folder), args.bag)
     return 0
 
 
