@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from analytic_world import _noise
 
-from sphstereo_ros.core.config import StereoConfig
+from sphstereo_ros.core.config import PARAMETERS, StereoConfig
 from sphstereo_ros.core.matching import (
     UNKNOWN,
     Matcher,
@@ -14,7 +14,8 @@ from sphstereo_ros.core.matching import (
     structure,
 )
 
-MATCHERS = ('flow', 'flow_fast', 'bm', 'sgbm')
+MATCHERS = PARAMETERS['stereo.matcher'].choices
+ONE_SIDED = ('bm', 'sgbm')  # their search ends at zero
 ROWS, COLUMNS = 200, 240
 INSIDE = (slice(20, -20), slice(70, -20))
 
@@ -61,7 +62,7 @@ def test_a_known_shift_is_found_with_its_sign_and_fraction(name, parallax):
 def test_only_a_signed_matcher_sees_parallax_below_zero(name):
     found = made(name)(*pair(-2.5))
     inside = found.pixels[INSIDE][known(found)[INSIDE]]
-    assert found.signed == name.startswith('flow')
+    assert found.signed == (name not in ONE_SIDED)
     if found.signed:
         assert np.median(inside) == pytest.approx(-2.5, abs=0.06)
     else:
@@ -69,7 +70,7 @@ def test_only_a_signed_matcher_sees_parallax_below_zero(name):
         assert len(inside) < 0.35 * found.pixels[INSIDE].size
 
 
-@pytest.mark.parametrize('name', ['bm', 'sgbm'])
+@pytest.mark.parametrize('name', ONE_SIDED)
 def test_the_first_columns_are_not_lost(name):
     """Columns left of the search range: without padding all are empty beside one pole."""
     found = made(name, num_disparities=96)(*pair(3.0))
@@ -79,13 +80,13 @@ def test_the_first_columns_are_not_lost(name):
     assert (np.abs(rim[[1, -2]] - 3.0) < 0.5).mean() > 0.5
 
 
-@pytest.mark.parametrize('name', ['flow', 'flow_fast'])
+@pytest.mark.parametrize('name', [m for m in MATCHERS if m not in ONE_SIDED])
 def test_motion_across_the_meridian_is_unknown(name):
     assert known(made(name)(*pair(3.0)))[INSIDE].mean() > 0.95
     assert known(made(name)(*pair(3.0, across=4.0)))[INSIDE].mean() < 0.1
 
 
-@pytest.mark.parametrize('name', ['flow', 'flow_fast'])
+@pytest.mark.parametrize('name', [m for m in MATCHERS if m not in ONE_SIDED])
 def test_views_that_show_different_things_are_mostly_unknown(name):
     columns, rows = np.arange(COLUMNS)[None], np.arange(ROWS)[:, None]
     found = made(name)(content(columns, rows), content(columns, rows, plane=500.0))
