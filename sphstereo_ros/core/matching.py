@@ -94,7 +94,7 @@ def flow_matcher(preset: str, finest_scale: int, smoothness: float = 20.0) -> Ma
         loop = _forth_and_back(there, back)
         along, across = there[..., 0], there[..., 1]
         half = cv2.resize(loop, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        sigma = cv2.magnitude(gradient_sigma(current), _FORTH_AND_BACK * half)
+        sigma = _length(gradient_sigma(current), _FORTH_AND_BACK * half)
         pixels = -along
         pixels[(loop > _LOOP) | (np.abs(across) > _ACROSS)] = UNKNOWN
         return Parallax(pixels, sigma, signed=True)
