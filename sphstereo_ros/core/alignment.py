@@ -38,10 +38,13 @@ def aligned_correspondences(reference: Image8, current: Image8, pose: RelativePo
         inside = np.zeros(grid.shape, bool)
         inside[grid.wrap:-grid.wrap, np.sin(grid.theta()) > np.sin(_POLE)] = True
         points, sigma = features(cur, spacing_for(count, grid.height), inside)
+        expected = None
     else:
         points = polar_angles(again.current, axes) / grid.pixel + offset
+        expected = polar_angles(again.reference @ pose.rotation.T, axes) / grid.pixel + offset
+        expected[:, 1] = nearest_turn(expected[:, 1], points[:, 1], 2 * grid.height)
         sigma = again.sigma / grid.pixel
-    moved, found = follow(cur, ref, points)
+    moved, found = follow(cur, ref, points, expected=expected)
 
     def bearings(pixels: Points) -> Floats:
         theta, azimuth = ((pixels[found] - offset) * grid.pixel).T
@@ -49,6 +52,11 @@ def aligned_correspondences(reference: Image8, current: Image8, pose: RelativePo
 
     return Correspondences(bearings(moved) @ pose.rotation, bearings(points),
                            sigma[found] * grid.pixel)
+
+
+def nearest_turn(rows: Floats, to: Floats, period: int) -> Floats:
+    """The rows, whole turns of `period` added, that are nearest to `to`."""
+    return np.asarray(to + (rows - to + period / 2) % period - period / 2)
 
 
 class Aligner:
@@ -97,7 +105,7 @@ class Aligner:
                  threshold: float) -> PoseEstimate | Drop:
         if len(points) < 100:
             return Drop('alignment_failed', f'{len(points)} points with texture')
-        refined = refine(pose.rotation, -pose.direction, points, iterations=12)
+        refined = refine(pose.rotation, -pose.direction, points)
         if refined is None:
             return Drop('alignment_failed', 'the aligned pair fixes no motion')
         # The robust loss adapts to any residuals, so inliers are counted by the threshold.

@@ -22,7 +22,6 @@ Floats = NDArray[np.float64]
 
 NOTHING = 1e6
 
-_TILE = 64
 _CONFIDENT = 3.0  # standard deviations
 
 
@@ -51,13 +50,13 @@ def _grid_angles(height: int) -> tuple[Map, Map, Map, Map]:
 
 
 @fast_kernel
-def _polar_row(cos_lat: np.float32, sin_lat: np.float32, cos_lon: Map, sin_lon: Map, left: int,
-               count: int, axes: Map, first: np.float32, wrap: np.float32, per_pixel: np.float32,
+def _polar_row(cos_lat: np.float32, sin_lat: np.float32, cos_lon: Map, sin_lon: Map, axes: Map,
+               first: np.float32, wrap: np.float32, per_pixel: np.float32,
                out: Map) -> None:  # pragma: no cover - compiled
     """Sine and cosine of θ, and column and row on the polar grid, of a row of pixels."""
     turn = np.float32(2 * np.pi)
-    for j in range(count):
-        x, y, z = cos_lat * sin_lon[left + j], -sin_lat, cos_lat * cos_lon[left + j]
+    for j in range(cos_lon.size):
+        x, y, z = cos_lat * sin_lon[j], -sin_lat, cos_lat * cos_lon[j]
         px = axes[0, 0] * x + axes[1, 0] * y + axes[2, 0] * z
         py = axes[0, 1] * x + axes[1, 1] * y + axes[2, 1] * z
         pz = axes[0, 2] * x + axes[1, 2] * y + axes[2, 2] * z
@@ -71,14 +70,14 @@ def _polar_row(cos_lat: np.float32, sin_lat: np.float32, cos_lon: Map, sin_lon: 
 
 
 @fast_kernel
-def _sample_row(parallax: Map, sigma: Map, at: Map, count: int,
+def _sample_row(parallax: Map, sigma: Map, at: Map,
                 out: Map) -> None:  # pragma: no cover - compiled
     """Parallax and its sigma where `at` lies on the grid.
 
     Bilinear where the four neighbours agree to a pixel, else the nearest: edges stay sharp.
     """
     half, one = np.float32(0.5), np.float32(1)
-    for j in range(count):
+    for j in range(at.shape[1]):
         column, row = at[2, j], at[3, j]
         c0, r0 = np.int32(column), np.int32(row)
         fc, fr = column - np.float32(c0), row - np.float32(r0)
@@ -92,13 +91,13 @@ def _sample_row(parallax: Map, sigma: Map, at: Map, count: int,
 
 
 @fast_kernel
-def _inverse_row(at: Map, found: Map, left: int, count: int, pixel: np.float32, noise: Map,
-                 rho_out: Map, sigma_out: Map) -> None:  # pragma: no cover - compiled
+def _inverse_row(at: Map, found: Map, pixel: np.float32, noise: Map, rho_out: Map,
+                 sigma_out: Map) -> None:  # pragma: no cover - compiled
     per_baseline = np.float32(1) / noise[0]
     rotation_variance = noise[1] * noise[1]
     direction_sigma, baseline_sigma = noise[2], noise[3]
     one, nothing = np.float32(1), np.float32(NOTHING)
-    for j in range(count):
+    for j in range(at.shape[1]):
         sine, cosine = at[0, j], at[1, j]
         delta = found[0, j] * pixel
         d2 = delta * delta
@@ -116,8 +115,8 @@ def _inverse_row(at: Map, found: Map, left: int, count: int, pixel: np.float32, 
         by_baseline = rho * baseline_sigma
         spread = np.sqrt(by_delta * by_delta * (match * match + rotation_variance)
                          + by_direction * by_direction + by_baseline * by_baseline)
-        rho_out[left + j] = rho if possible else np.float32(0)
-        sigma_out[left + j] = spread if possible else nothing
+        rho_out[j] = rho if possible else np.float32(0)
+        sigma_out[j] = spread if possible else nothing
 
 
 @fast_kernel
@@ -126,15 +125,13 @@ def _rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map, sin_l
           wrap: np.float32, noise: Map, rho_out: Map,
           sigma_out: Map) -> None:  # pragma: no cover - compiled
     half = np.float32(0.5)
-    at = np.empty((4, _TILE), np.float32)
-    found = np.empty((2, _TILE), np.float32)
-    for left in range(0, cos_lon.size, _TILE):  # tiles: neighbours on the grid stay in cache
-        count = min(_TILE, cos_lon.size - left)
-        for i in range(first, last):
-            _polar_row(cos_lat[i], sin_lat[i], cos_lon, sin_lon, left, count, axes, margin - half,
-                       wrap - half, np.float32(1) / pixel, at)
-            _sample_row(parallax, sigma, at, count, found)
-            _inverse_row(at, found, left, count, pixel, noise, rho_out[i], sigma_out[i])
+    at = np.empty((4, cos_lon.size), np.float32)
+    found = np.empty((2, cos_lon.size), np.float32)
+    for i in range(first, last):
+        _polar_row(cos_lat[i], sin_lat[i], cos_lon, sin_lon, axes, margin - half, wrap - half,
+                   np.float32(1) / pixel, at)
+        _sample_row(parallax, sigma, at, found)
+        _inverse_row(at, found, pixel, noise, rho_out[i], sigma_out[i])
 
 
 def inverse_range(parallax: Parallax, grid: PolarGrid, axes: Floats, pose: RelativePose,

@@ -17,6 +17,9 @@ from .jit import kernel
 
 Floats = NDArray[np.float64]
 
+_TUKEY = 4.685
+_SMALL_STEP = 1e-6  # rad, after which refinement stops
+
 
 @dataclass(frozen=True)
 class Correspondences:
@@ -51,9 +54,7 @@ class PoseEstimate:
     @property
     def covariance6(self) -> Floats:
         """Covariance (6, 6) of the small rotation and of the unit direction (3,)."""
-        spread = np.zeros((6, 5))
-        spread[:3, :3] = np.eye(3)
-        spread[3:, 3:] = tangent(self.direction)
+        spread = _spread(self.direction)
         return spread @ self.covariance @ spread.T
 
 
@@ -180,28 +181,53 @@ def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iter
     None where the correspondences do not fix five parameters.
 
     """
-    expected = points.sigma
-    scale, w = floor, expected
     residual, derivatives = np.empty(len(points)), np.empty((len(points), 6))
     for iteration in range(iterations):
-        basis = tangent(direction)
+        spread = _spread(direction)
         _residuals(rotation, direction, points.reference, points.current, residual, derivatives)
-        jacobian = np.concatenate([derivatives[:, :3], derivatives[:, 3:] @ basis], axis=1)
-        normalised = residual / expected
+        normalised = residual / points.sigma
         scale = max(1.4826 * float(np.median(np.abs(normalised))), floor)
         # Near points fix the direction, and a wrong start moves them most: first a wide loss.
-        width = 4.685 * scale * max(8 * 0.5**iteration, 1)
-        w = (np.clip(1 - (normalised / width)**2, 0, None) / expected)**2
-        weighted = jacobian * w[:, None]
-        normal = weighted.T @ jacobian
+        width = _TUKEY * scale * max(4 * 0.5**iteration, 1)
+        sums = np.zeros((6, 7))
+        inliers = _normal_equations(residual, derivatives, points.sigma, width, sums)
+        normal = spread.T @ sums[:, :6] @ spread
         if not np.isfinite(normal).all() or np.linalg.cond(normal) > 1e10:
             return None
-        step = -np.linalg.solve(normal, weighted.T @ residual)
+        step = -np.linalg.solve(normal, spread.T @ sums[:, 6])
         rotation = rotations.exp(step[:3]) @ rotation
-        direction = direction + basis @ step[3:]
+        direction = direction + spread[3:, 3:] @ step[3:]
         direction = direction / np.linalg.norm(direction)
-        if width <= 4.685 * scale and np.abs(step).max() < 1e-8:
+        if width <= _TUKEY * scale and np.abs(step).max() < _SMALL_STEP:
             break
     covariance = np.asarray(np.linalg.inv(normal) * scale**2, np.float64)
-    spread = scale * float(np.median(expected))
-    return PoseEstimate(rotation, direction, w > 0, covariance, spread)
+    return PoseEstimate(rotation, direction, inliers, covariance,
+                        scale * float(np.median(points.sigma)))
+
+
+def _spread(direction: Floats) -> Floats:
+    """(6, 5): a small rotation and two angles of the direction → rotation and direction."""
+    spread = np.zeros((6, 5))
+    spread[:3, :3] = np.eye(3)
+    spread[3:, 3:] = tangent(direction)
+    return spread
+
+
+@kernel
+def _normal_equations(residual: Floats, derivatives: Floats, sigma: Floats, width: float,
+                      sums: Floats) -> NDArray[np.bool_]:  # pragma: no cover - compiled
+    """Add JᵀWJ and JᵀWr with Tukey's weights to `sums` (6, 7); which points have a weight."""
+    inliers = np.zeros(len(residual), np.bool_)
+    for k in range(len(residual)):
+        ratio = residual[k] / (sigma[k] * width)
+        root = 1 - ratio * ratio
+        if not root > 0:
+            continue
+        inliers[k] = True
+        weight = (root / sigma[k])**2
+        for a in range(6):
+            scaled = weight * derivatives[k, a]
+            for b in range(6):
+                sums[a, b] += scaled * derivatives[k, b]
+            sums[a, 6] += scaled * residual[k]
+    return inliers

@@ -62,15 +62,20 @@ def features(image: Image8, spacing: int,
     return np.stack([u[keep], v[keep]], axis=1).astype(np.float32), sigma[keep].astype(float)
 
 
-def follow(source: Image8, target: Image8, points: Points, *, window: int = 11,
-           levels: int = 3) -> tuple[Points, NDArray[np.bool_]]:
-    """Pyramidal Lucas–Kanade: where `points` (N, 2) of `source` are in `target`, and if found."""
+def follow(source: Image8, target: Image8, points: Points, *, expected: Points | None = None,
+           window: int = 11, levels: int = 3) -> tuple[Points, NDArray[np.bool_]]:
+    """Pyramidal Lucas–Kanade: where `points` (N, 2) of `source` are in `target`, and if found.
+
+    expected : (N, 2), where they are to a pixel or so: no pyramid is needed then
+    """
     if not len(points):
         return points, np.zeros(0, bool)
+    start = None if expected is None else np.array(expected[:, None], np.float32)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        source, target, np.asarray(points[:, None], np.float32), None,
-        winSize=(window, window), maxLevel=levels,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.003))
+        source, target, np.asarray(points[:, None], np.float32), start,
+        winSize=(window, window), maxLevel=levels if expected is None else 0,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.003),
+        flags=0 if expected is None else cv2.OPTFLOW_USE_INITIAL_FLOW)
     return found[:, 0], status[:, 0].astype(bool)
 
 
