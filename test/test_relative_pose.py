@@ -155,7 +155,7 @@ def test_matches_that_are_expected_to_be_worse_count_less():
     rng = np.random.default_rng(8)
     position, rotation = unit([1, 0, 1]), random_rotation(rng, 0.05)
     errors = {'told': [], 'not told': []}
-    for _ in range(20):
+    for _ in range(40):
         good = correspondences(rng, 150, rotation, position, noise=1e-4)
         poor = correspondences(rng, 150, rotation, position, noise=2e-3)
         both = [np.concatenate(p) for p in ((good.reference, poor.reference),
@@ -164,7 +164,7 @@ def test_matches_that_are_expected_to_be_worse_count_less():
             sigmas = np.repeat([1e-4, sigma], 150)
             pose = refine(rotation, position, Correspondences(*both, sigmas))
             errors[name].append(angle_between(pose.direction, position))
-    assert np.median(errors['told']) < 0.5 * np.median(errors['not told'])
+    assert np.median(errors['told']) < 0.75 * np.median(errors['not told'])
 
 
 def test_part_of_the_correspondences_keeps_their_sigmas():
