@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphstereo_ros.core.frames import Drop
-from sphstereo_ros.replay.parameter_files import load_values
+from sphstereo_ros.replay.parameter_files import load_config
 from sphstereo_ros.replay.records import BadInput
 from sphstereo_ros.replay.sources import image_topic, open_source
 from sphstereo_ros.ros.conversions import decode_frame
@@ -58,7 +58,7 @@ def main(args: argparse.Namespace) -> int:
     if args.height < 60 or not args.rate > 0 or not args.seconds >= 1:
         raise BadInput('--height: at least 60; --rate: above 0; --seconds: at least 1')
     files = args.params or [shipped('config/live.yaml')]
-    load_values(files, args.overrides)  # refused here rather than by each node
+    load_config(files, args.overrides)  # refused here rather than by each node
     result = _run(args, node_arguments(files, args.overrides))
     print(table(result))
     if args.json:
