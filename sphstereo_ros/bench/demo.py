@@ -163,9 +163,15 @@ def _figures(arrivals: Mapping[str, list[tuple[int, int]]], totals: dict[str, di
             drops[part] = causes
     return {'seconds': round(seconds, 2), 'frames_in': len(inside[IMAGE]),
             'depth_out': len(inside[DEPTH]), 'clouds_out': len(inside[CLOUD]),
-            'rate_in_hz': round(len(inside[IMAGE]) / seconds, 2),
-            'rate_depth_hz': round(len(inside[DEPTH]) / seconds, 2),
+            'rate_in_hz': _rate(inside[IMAGE]), 'rate_depth_hz': _rate(inside[DEPTH]),
             'latency_ms': numbers(latency), 'drops': drops}
+
+
+def _rate(arrivals: list[tuple[int, int]]) -> float:
+    """Messages a second from the first to the last; 0 for less than two."""
+    if len(arrivals) < 2:
+        return 0.0
+    return round((len(arrivals) - 1) / (arrivals[-1][1] - arrivals[0][1]) * 1e9, 2)
 
 
 def _decoded(data: bytes, topic: str) -> Any:
