@@ -135,7 +135,12 @@ def ransac(points: Correspondences, threshold: float, rng: np.random.Generator, 
         return None
     poses = decompose(best)
     support = points[np.abs(epipolar_residuals(*poses[0], points)) < threshold]
-    return max(poses, key=lambda pose: int(in_front(pose[0], pose[1], support).sum()))
+    rotation, direction = max(poses,
+                              key=lambda pose: int(in_front(pose[0], pose[1], support).sum()))
+    # Far points lie on either side by chance; the sign is for those that moved to tell.
+    moved = support[parallax(rotation, support) > threshold]
+    ahead, behind = (int(in_front(rotation, p, moved).sum()) for p in (direction, -direction))
+    return rotation, direction if ahead >= behind else -direction
 
 
 @kernel

@@ -20,12 +20,16 @@ from .relative_pose import (
     Correspondences,
     PoseEstimate,
     epipolar_residuals,
+    in_front,
     parallax,
     ransac,
     refine,
     rotation_between,
 )
-from .tracking import track
+from .tracking import match, track
+
+_BEHIND = 1 / 3  # largest share of points that moved, but behind the cameras
+_COARSE = 2.0  # parallax that matched descriptors must show, as a multiple of the threshold
 
 
 def reduced(image: Image8, height: int) -> Image8:
@@ -50,12 +54,21 @@ def estimate(points: Correspondences, config: PoseConfig) -> PoseEstimate | Drop
         return Drop('too_few_inliers', 'no pose fits the correspondences')
     # The robust loss adapts its width to the residuals, so inliers are counted by the threshold.
     residual = np.abs(epipolar_residuals(pose.rotation, pose.direction, points))
-    inliers = int((pose.inliers & (residual < config.inlier_threshold)).sum())
-    if inliers < max(config.min_inliers, config.min_inlier_ratio * len(points)):
-        return Drop('too_few_inliers', f'{inliers} of {len(points)}')
-    moved = float(np.median(parallax(pose.rotation, points[pose.inliers])))
-    if moved < config.min_parallax:
-        return Drop('no_parallax', f'median parallax {np.degrees(moved):.3f}°')
+    inliers = pose.inliers & (residual < config.inlier_threshold)
+    angle = parallax(pose.rotation, points)
+    enough = max(config.min_inliers, config.min_inlier_ratio * len(points))
+    if inliers.sum() >= enough:
+        middle = float(np.median(angle[pose.inliers]))
+        if middle < config.min_parallax:
+            return Drop('no_parallax', f'median parallax {np.degrees(middle):.3f}°')
+    # By chance a point fits any epipolar plane, but then as often behind the cameras as ahead.
+    moved = inliers & (angle > config.inlier_threshold)
+    behind = moved & ~in_front(pose.rotation, pose.direction, points)
+    count = int((inliers & ~behind).sum())
+    if count < enough:
+        return Drop('too_few_inliers', f'{count} of {len(points)}')
+    if behind.sum() > _BEHIND * moved.sum():
+        return Drop('too_few_inliers', f'{behind.sum()} of {moved.sum()} lie behind the cameras')
     return pose
 
 
@@ -88,12 +101,32 @@ class Stabiliser:
                   for frame in (reference.frame, window.current)]
         if images[0].shape != images[1].shape:
             return Drop('size_changed', f'{images[0].shape} and {images[1].shape}')
-        points = track(images[0], images[1], reference.pose.rotation, config.max_points,
-                       self._mask_like(images[1]))
+        mask = self._mask_like(images[1])
+        points = track(images[0], images[1], reference.pose.rotation, config.max_points, mask)
         pose = estimate(points, config)
+        if isinstance(pose, Drop) and pose.cause == 'too_few_inliers':
+            pose = self._second_attempt(images[0], images[1], mask, pose)
         if isinstance(pose, Drop):
             return pose
         return replace(reference, pose=with_length(pose, reference.pose))
+
+    def _second_attempt(self, reference: Image8, current: Image8, mask: Image8 | None,
+                        first: Drop) -> PoseEstimate | Drop:
+        """Match descriptors, then track once more from the rotation that they tell.
+
+        For large motion, and for rotation that the prior does not know.
+        """
+        config = self.config
+        points = match(reference, current, config.max_points, mask)
+        coarse = estimate(points, config)
+        if isinstance(coarse, Drop):
+            return first if coarse.cause == 'too_few_points' else coarse
+        again = estimate(track(reference, current, coarse.rotation, config.max_points, mask),
+                         config)
+        if not isinstance(again, Drop) or again.cause == 'no_parallax':
+            return again
+        moved = np.median(parallax(coarse.rotation, points[coarse.inliers]))
+        return coarse if moved > _COARSE * config.inlier_threshold else again
 
     def _mask_like(self, image: NDArray[np.uint8]) -> Image8 | None:
         if self._mask is None:

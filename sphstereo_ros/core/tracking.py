@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import cv2
 import numpy as np
@@ -21,6 +22,9 @@ Points = NDArray[np.floating]
 _BLOCK = 5
 _GREY_SQUARED = (4 * 255 * _BLOCK / 8 / _BLOCK)**2 / 4
 _NOISE, _FLOOR, _WORST = 1.5 / 11, 0.05, 0.5
+
+# Descriptors: the nearest must be nearer than the second by this factor; error of a match (px).
+_DISTINCT, _MATCHED = 0.8, 0.5
 
 _WRAP = 48  # columns that wrap round on each side, so that tracks cross the seam
 _POLE = 0.2  # rad round zenith and nadir where an equirectangular image is too stretched to track
@@ -84,6 +88,19 @@ def spacing_for(count: int, height: int) -> int:
     return max(5, round(math.sqrt(2 * height * height / count)))
 
 
+def _wrapped(image: Image8) -> Image8:
+    return np.asarray(cv2.copyMakeBorder(image, 0, 0, _WRAP, _WRAP, cv2.BORDER_WRAP))
+
+
+def _usable(image: Image8, mask: Image8 | None) -> NDArray[np.bool_]:
+    """Where features may lie in the wrapped image: not at the poles, nor on the vehicle."""
+    height, width = image.shape
+    usable = np.zeros((height, width + 2 * _WRAP), bool)
+    cap = round(_POLE / np.pi * height)
+    usable[cap:height - cap, _WRAP:-_WRAP] = True if mask is None else mask[cap:height - cap] == 0
+    return usable
+
+
 def track(reference: Image8, current: Image8, rotation: Floats, count: int,
           mask: Image8 | None = None) -> Correspondences:
     """Bearings of the same points in two equirectangular images of (H, 2H) uint8.
@@ -101,12 +118,8 @@ def track(reference: Image8, current: Image8, rotation: Floats, count: int,
     turned = reference
     if not np.allclose(rotation, np.eye(3), atol=1e-6):
         turned = resample(with_border(reference), rotation_map(rotation.T, reference.shape))
-    wrapped = [cv2.copyMakeBorder(im, 0, 0, _WRAP, _WRAP, cv2.BORDER_WRAP)
-               for im in (current, turned)]
-    usable = np.zeros(wrapped[0].shape, bool)
-    cap = round(_POLE / np.pi * height)
-    usable[cap:height - cap, _WRAP:-_WRAP] = True if mask is None else mask[cap:height - cap] == 0
-    points, sigma = features(wrapped[0], spacing_for(count, height), usable)
+    wrapped = [_wrapped(im) for im in (current, turned)]
+    points, sigma = features(wrapped[0], spacing_for(count, height), _usable(current, mask))
     moved, found = follow(wrapped[0], wrapped[1], points, levels=4)
     found &= np.abs(moved[:, 1] - height / 2) < height / 2 - 1
     camera = Equirectangular(height, width)
@@ -114,3 +127,33 @@ def track(reference: Image8, current: Image8, rotation: Floats, count: int,
     before, now = (np.asarray(camera.unproject(p[found] - offset), np.float64)
                    for p in (moved, points))
     return Correspondences(before @ rotation, now, sigma[found] * np.pi / height)
+
+
+def match(reference: Image8, current: Image8, count: int,
+          mask: Image8 | None = None) -> Correspondences:
+    """Bearings of the same points in two equirectangular images of (H, 2H) uint8, wherever they
+    went: the nearest SIFT descriptors (Lowe 2004) over the whole sphere, each the other's.
+
+    Slower and less exact than `track`, but for rotations of 45° and for large parallax.
+    Parameters as for `track`.
+    """
+    sift = cv2.SIFT_create(count)
+    height, width = current.shape
+    found = [sift.detectAndCompute(_wrapped(image), _usable(image, mask).astype(np.uint8))
+             for image in (reference, current)]
+    (points, before), (points_now, now) = found
+    if before is None or now is None or min(len(before), len(now)) < 2:
+        return Correspondences(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    back = {m.queryIdx: m.trainIdx for m in matcher.match(before, now)}
+    pairs = [(m.trainIdx, m.queryIdx) for m, second in matcher.knnMatch(now, before, k=2)
+             if m.distance < _DISTINCT * second.distance and back[m.trainIdx] == m.queryIdx]
+    camera = Equirectangular(height, width)
+
+    def bearings(pixels: list[Any]) -> Floats:
+        offset = np.array([_WRAP, 0.0])
+        return np.asarray(camera.unproject(np.reshape(pixels, (-1, 2)) - offset), np.float64)
+
+    return Correspondences(bearings([points[i].pt for i, _ in pairs]),
+                           bearings([points_now[j].pt for _, j in pairs]),
+                           np.full(len(pairs), _MATCHED * np.pi / height))
