@@ -22,6 +22,8 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import QoSProfile  # noqa: E402
 
+from sphstereo_ros.ros.transport import SMALL_PROFILE  # noqa: E402
+
 START = ('import sys; from sphstereo_ros.nodes.{} import main; '
          'sys.argv[0] = "node"; sys.exit(main())')
 PATIENCE = 40.0  # seconds until a condition that should long hold fails a test
@@ -63,7 +65,10 @@ class Client:
 
     def __init__(self, domain: int) -> None:
         self._context = rclpy.Context()
-        rclpy.init(context=self._context, domain_id=domain)
+        with pytest.MonkeyPatch.context() as patch:
+            # With ROS's own transport it would find late nodes after 3 s only.
+            patch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', str(SMALL_PROFILE))
+            rclpy.init(context=self._context, domain_id=domain)
         self.node = rclpy.create_node('client', context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
@@ -85,15 +90,17 @@ class Client:
         self.until(lambda: publisher.get_subscription_count() >= readers, f'a reader of {topic}')
         return publisher
 
-    def camera(self, kind: Any, topic: str, node: str) -> Any:
-        """A publisher of images that `node` surely hears.
+    def heard(self, kind: Any, topic: str, node: str) -> Any:
+        """A publisher that `node` surely hears.
 
-        A best-effort reader may not know its writer yet when the writer knows it already, so
-        empty images are sent until the node has counted one.
+        A reader may not know its writer yet when the writer knows it already, so empty messages
+        are sent until the node has counted one more drop.
         """
         publisher = self.publisher(kind, topic)
+        self.until(lambda: node in self.statuses(), f'a status of {node}')
+        before = value(self.statuses()[node], 'drops')
         probe = self.node.create_timer(0.1, lambda: publisher.publish(kind()))
-        self.until(lambda: node in self.statuses() and value(self.statuses()[node], 'frames_in'),
+        self.until(lambda: value(self.statuses()[node], 'drops') > before,
                    f'{node} to hear {topic}')
         self.node.destroy_timer(probe)
         return publisher
@@ -221,7 +228,7 @@ class Graph:
 
 @contextmanager
 def graph(folder: Path) -> Iterator[Graph]:
-    """Open a graph; whatever runs in it at the end is killed."""
+    """Open a graph; whatever runs in it at the end is ended."""
     saved = dict(os.environ)
     made = Graph(folder)
     try:

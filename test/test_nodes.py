@@ -79,7 +79,7 @@ def test_four_processes_give_what_the_core_gives(ros: Graph) -> None:
                            ('pairs/aligned', 2), ('odometry/visual', 2), ('depth/image', 1)):
         client.linked(topic, readers)
     motion = client.publisher(Odometry, 'odometry')
-    image = client.camera(Image, 'image', 'frame_pairing')
+    image = client.heard(Image, 'image', 'frame_pairing')
     for i, frame in enumerate(frames()):
         motion.publish(odometry(*moved(i)))
         image.publish(mono8(frame.key.stamp, frame.image))
@@ -146,7 +146,7 @@ def test_pipeline_on_compressed_images_without_a_baseline(ros: Graph) -> None:
                         ('points', PointCloud2), ('frames', Image)):
         client.subscribe(kind, f'/robot/{topic}')
         client.linked(f'/robot/{topic}')
-    image = client.camera(CompressedImage, '/robot/image/compressed', 'pipeline: frame_pairing')
+    image = client.heard(CompressedImage, '/robot/image/compressed', 'pipeline: frame_pairing')
     for i, frame in enumerate(frames()):
         image.publish(png(frame.key.stamp, frame.image))
         sent = client.stamped('/robot/frames', frame.key.stamp)
@@ -190,7 +190,7 @@ def test_bad_input_is_a_named_drop_and_the_node_lives(ros: Graph) -> None:
     process = ros.start('pipeline', 'baseline.length:=0.15', 'stereo.matcher:=bm')
     client.subscribe(Image, 'depth/image')
     client.linked('depth/image')
-    image = client.camera(Image, 'image', 'pipeline: frame_pairing')
+    image = client.heard(Image, 'image', 'pipeline: frame_pairing')
     motion = client.publisher(Odometry, 'odometry')
     first, second, third = frames()[:3]
     bad = {cause: mono8(first.key.stamp, first.image) for cause in
@@ -247,7 +247,8 @@ sys.exit(run('pose_stabilisation', lambda shell: [StageComponent(
 def test_an_exception_is_counted_and_ends_nothing(ros: Graph) -> None:
     client = ros.client
     process = ros.start('pose_stabilisation', code=FAILING)
-    image, pairs = client.publisher(Image, 'frames'), client.publisher(PathMessage, 'pairs')
+    image = client.heard(Image, 'frames', 'pose_stabilisation')
+    pairs = client.heard(PathMessage, 'pairs', 'pose_stabilisation')
     for stamp in range(1, 4):
         image.publish(mono8(stamp, np.zeros((8, 16), np.uint8)))
         if stamp > 1:
@@ -266,7 +267,7 @@ def test_a_running_stage_takes_new_parameters(ros: Graph) -> None:
     ros.start('pipeline', 'stereo.matcher:=bm')
     client.subscribe(Image, 'depth/relative')
     client.linked('depth/relative')
-    image = client.camera(Image, 'image', 'pipeline: frame_pairing')
+    image = client.heard(Image, 'image', 'pipeline: frame_pairing')
     for frame in frames()[:2]:
         image.publish(mono8(frame.key.stamp, frame.image))
     client.stamped('depth/relative', frames()[1].key.stamp)
@@ -283,8 +284,8 @@ def test_a_running_stage_takes_new_parameters(ros: Graph) -> None:
 def test_stages_name_what_is_wrong_with_windows(ros: Graph) -> None:
     client = ros.client
     ros.start('pose_stabilisation')
-    image, pairs = client.publisher(Image, 'frames'), client.publisher(PathMessage, 'pairs')
-    pairs.publish(PathMessage())
+    image = client.heard(Image, 'frames', 'pose_stabilisation')
+    pairs = client.heard(PathMessage, 'pairs', 'pose_stabilisation')
     client.dropped('pose_stabilisation', 'too_few_poses')
     broken = mono8(5, np.zeros((8, 16), np.uint8))
     broken.encoding = 'klingon'
@@ -315,8 +316,9 @@ def test_twist_and_imu_reach_the_pairing(ros: Graph) -> None:
     ros.start('frame_pairing', 'baseline.source:=twist')
     client.subscribe(PathMessage, 'pairs')
     client.linked('pairs')
-    motion, imu = client.publisher(TwistStamped, 'twist'), client.publisher(Imu, 'imu')
-    image = client.camera(Image, 'image', 'frame_pairing')
+    motion = client.publisher(TwistStamped, 'twist')
+    imu = client.heard(Imu, 'imu', 'frame_pairing')
+    image = client.heard(Image, 'image', 'frame_pairing')
     grey = np.zeros((8, 16), np.uint8)
     for stamp in (10**9, 10**9 + 500_000_000):
         twist = TwistStamped()
@@ -337,7 +339,7 @@ def test_both_transports_of_one_camera_give_every_frame_once(ros: Graph) -> None
     ros.start('frame_pairing')
     client.subscribe(PathMessage, 'pairs')
     client.linked('pairs')
-    raw = client.camera(Image, 'image', 'frame_pairing')
+    raw = client.heard(Image, 'image', 'frame_pairing')
     compressed = client.publisher(CompressedImage, 'image/compressed')
     image = frames()[0].image
     for stamp in range(1, 5):
@@ -376,7 +378,7 @@ def test_a_node_that_comes_back_is_in_the_flow_again(ros: Graph) -> None:
     for topic, readers in (('frames', 3), ('pairs', 1), ('pairs/stabilised', 1),
                            ('pairs/aligned', 1), ('depth/image', 1)):
         client.linked(topic, readers)
-    image = client.camera(Image, 'image', 'frame_pairing')
+    image = client.heard(Image, 'image', 'frame_pairing')
     stamp, sent, wanted = frames()[0].key.stamp, 0, 1
 
     def flows() -> bool:

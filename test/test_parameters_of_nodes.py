@@ -144,7 +144,8 @@ def test_descriptors_tell_type_bounds_and_meaning(ros: Graph) -> None:
     assert (minimum.floating_point_range[0].from_value,
             minimum.floating_point_range[0].to_value) == (0.0, 1000.0)
     assert (block.type, block.integer_range[0].to_value) == (2, 51)
-    assert matcher.additional_constraints == 'one of flow, flow_fast, bm, sgbm'
+    assert matcher.additional_constraints == 'one of ' + ', '.join(
+        PARAMETERS['stereo.matcher'].choices)
     assert height.read_only
     assert not minimum.read_only
 
@@ -154,7 +155,7 @@ def test_a_running_node_takes_a_new_baseline(ros: Graph) -> None:
     ros.start('frame_pairing', 'baseline.length:=0.3')
     client.subscribe(PathMessage, 'pairs')
     client.linked('pairs')
-    image = client.camera(Image, 'image', 'frame_pairing')
+    image = client.heard(Image, 'image', 'frame_pairing')
     grey = np.zeros((8, 16), np.uint8)
     for stamp in (1, 2):
         image.publish(mono8(stamp, grey))
@@ -179,7 +180,7 @@ def test_a_running_node_waits_for_odometry(ros: Graph) -> None:
     client.subscribe(PathMessage, 'pairs')
     client.linked('pairs')
     motion = client.publisher(Odometry, 'odometry')
-    image = client.camera(Image, 'image', 'frame_pairing')
+    image = client.heard(Image, 'image', 'frame_pairing')
     motion.publish(odometry(10, 0.0))
     for stamp in (10, 20):
         image.publish(mono8(stamp, np.zeros((8, 16), np.uint8)))
@@ -220,7 +221,7 @@ def test_the_command_line_wins_over_files(ros: Graph, tmp_path: Path,
     process = ros.start('frame_pairing', *(word.format(file) for word in words))
     ros.client.subscribe(PathMessage, 'pairs')
     ros.client.linked('pairs')
-    image = ros.client.camera(Image, 'image', 'frame_pairing')
+    image = ros.client.heard(Image, 'image', 'frame_pairing')
     for stamp in (1, 2):
         image.publish(mono8(stamp, np.zeros((8, 16), np.uint8)))
     assert ros.client.stamped('pairs', 2).poses[0].pose.position.z == -0.5
