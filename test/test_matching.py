@@ -9,9 +9,9 @@ from sphstereo_ros.core.matching import (
     UNKNOWN,
     Matcher,
     Parallax,
-    gradient_sigma,
     matcher,
     structure,
+    structure_sigma,
 )
 
 MATCHERS = PARAMETERS['stereo.matcher'].choices
@@ -126,11 +126,12 @@ def test_structure_is_the_root_mean_square_gradient_along_theta(amplitude):
 
 def test_sigma_falls_with_structure_to_a_floor():
     rng = np.random.default_rng(0)
-    sigmas = [float(np.median(gradient_sigma(np.clip(
-        128 + contrast * rng.normal(size=(64, 64)), 0, 255).astype(np.uint8))))
+    sigmas = [float(np.median(structure_sigma(np.clip(
+        128 + contrast * rng.normal(size=(64, 64)), 0, 255).astype(np.uint8), (0.1, 2.0))))
         for contrast in (0.0, 1.0, 5.0, 20.0, 60.0)]
     assert sigmas == sorted(sigmas, reverse=True)
-    assert 0 < sigmas[-1] < 0.2 * sigmas[0]
+    assert 0.1 < sigmas[-1] < 0.2 * sigmas[0]
+    assert 1.9 < sigmas[0] < 2.1
 
 
 def test_all_block_sizes_work_with_all_matchers():

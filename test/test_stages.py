@@ -542,8 +542,7 @@ def test_warming_up_leaves_a_stage_as_it_was(stage):
     stage(resolve({})).warm_up()
 
 
-@pytest.mark.parametrize('matcher', [*(m for m in MATCHERS if m != 'sgbm'), pytest.param(
-    'sgbm', marks=pytest.mark.xfail(reason='its smoothness fills blank surfaces', strict=True))])
+@pytest.mark.parametrize('matcher', MATCHERS)
 def test_blank_surfaces_are_unknown(matcher):
     sky = World(blank_above=True)
     current, reference = seen(sky), before('forward', world=sky)

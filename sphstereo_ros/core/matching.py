@@ -20,6 +20,8 @@ from .jit import kernel, rows_in_parallel
 
 Pixels = NDArray[np.float32]
 
+Bounds = tuple[float, float]
+
 UNKNOWN = -1e5  # more than a turn at any size
 
 
@@ -39,10 +41,14 @@ class Parallax:
 
 Matcher = Callable[[Image8, Image8], Parallax]
 
-# Constants of the error model, fitted to the tuning scenes: a floor, the grey-level noise that
-# gradients are weighed against, and the weight of the forward–backward difference.
-_FLOOR = 0.04
-_NOISE = 1.2
+# The error model, fitted to the tuning scenes. A match of structure s (grey levels per pixel) errs
+# by _GREY / sqrt(s² − noise²) px beside the matcher's own floor, and by a share of the loop from
+# forth and back. The noise is taken from the least structured part of the picture, within bounds.
+_GREY = 0.1
+# Each matcher has its least and its most: smooth flow carries a blank patch along with its rim,
+# which a window by itself cannot.
+_BOUNDS = {'bm': (0.1, 50.0), 'sgbm': (0.18, 5.0), 'flow': (0.1, 2.0), 'flow_fast': (0.25, 2.0)}
+_LEAST_NOISE, _MOST_NOISE = 0.15, 0.5
 _FORTH_AND_BACK = 0.5
 
 _LOOP, _ACROSS = 1.5, 1.0  # px, in which a flow is consistent
@@ -59,9 +65,17 @@ def structure(image: Image8, window: int = 9) -> Pixels:
     return np.asarray(cv2.sqrt(cv2.boxFilter(squared, -1, (window, window))))
 
 
-def gradient_sigma(image: Image8) -> Pixels:
-    """Standard deviation of a match in px from the image's structure alone, at half size."""
-    return _FLOOR + np.float32(0.3 * _NOISE) / (structure(image) + np.float32(0.3))
+def structure_sigma(image: Image8, bounds: Bounds) -> Pixels:
+    """Standard deviation of a match in px from the image's structure, at half size.
+
+    bounds : least and most; structure that is not above the noise tells nothing: the most
+    """
+    found = structure(image)
+    noise = 1.6 * float(np.percentile(found[::8, ::8], 5))
+    noise = min(max(noise, _LEAST_NOISE), _MOST_NOISE)
+    least, most = bounds
+    signal = np.maximum(found * found - np.float32(noise**2), np.float32((_GREY / most)**2))
+    return np.asarray(np.sqrt(np.float32(least**2) + np.float32(_GREY**2) / signal))
 
 
 def inverse_search(preset: str, finest_scale: int) -> Any:
@@ -77,13 +91,14 @@ def inverse_search(preset: str, finest_scale: int) -> Any:
     return search
 
 
-def flow_matcher(preset: str, finest_scale: int, smoothness: float = 20.0) -> Matcher:
+def flow_matcher(preset: str, finest_scale: int, smoothness: float, bounds: Bounds) -> Matcher:
     """Dense inverse search flow, kept where it is consistent.
 
     A match stands if the flow back from the reference returns to within 1.5 pixels, and if it
     stays within one pixel of its meridian.
 
     smoothness : weight of smoothness in the variational refinement
+    bounds : least and most standard deviation of a match by structure, px
     """
     search = inverse_search(preset, finest_scale)
     search.setVariationalRefinementAlpha(smoothness)
@@ -94,7 +109,7 @@ def flow_matcher(preset: str, finest_scale: int, smoothness: float = 20.0) -> Ma
         loop = _forth_and_back(there, back)
         along, across = there[..., 0], there[..., 1]
         half = cv2.resize(loop, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        sigma = _length(gradient_sigma(current), _FORTH_AND_BACK * half)
+        sigma = _length(structure_sigma(current, bounds), _FORTH_AND_BACK * half)
         pixels = -along
         pixels[(loop > _LOOP) | (np.abs(across) > _ACROSS)] = UNKNOWN
         return Parallax(pixels, sigma, signed=True)
@@ -152,7 +167,7 @@ def _from_fixed_point(first: int, last: int, disparity: NDArray[np.int16],
             pixels[i, j] = d * np.float32(0.0625) if d > 0 else np.float32(UNKNOWN)
 
 
-def _opencv_matcher(stereo: Any, disparities: int, block: int) -> Matcher:
+def _opencv_matcher(stereo: Any, disparities: int, block: int, bounds: Bounds) -> Matcher:
     """A StereoBM or StereoSGBM, padded: it leaves the first columns and the rim empty."""
     left, rim = disparities + block // 2, block // 2
 
@@ -162,7 +177,7 @@ def _opencv_matcher(stereo: Any, disparities: int, block: int) -> Matcher:
         disparity = stereo.compute(*padded)[rim:-rim, left:-rim]
         pixels = np.empty(current.shape, np.float32)
         rows_in_parallel(_from_fixed_point, len(pixels), disparity, pixels)
-        return Parallax(pixels, gradient_sigma(current), signed=False)
+        return Parallax(pixels, structure_sigma(current, bounds), signed=False)
 
     return match
 
@@ -171,7 +186,7 @@ def block_matcher(disparities: int, block: int) -> Matcher:
     """OpenCV's StereoBM, as in the paper."""
     stereo = cv2.StereoBM_create(disparities, block)
     stereo.setUniquenessRatio(10)
-    return _opencv_matcher(stereo, disparities, block)
+    return _opencv_matcher(stereo, disparities, block, _BOUNDS['bm'])
 
 
 def semi_global_matcher(disparities: int, block: int) -> Matcher:
@@ -179,7 +194,7 @@ def semi_global_matcher(disparities: int, block: int) -> Matcher:
     stereo = cv2.StereoSGBM_create(
         0, disparities, block, P1=2 * block * block, P2=16 * block * block, uniquenessRatio=5,
         disp12MaxDiff=1, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY)
-    return _opencv_matcher(stereo, disparities, block)
+    return _opencv_matcher(stereo, disparities, block, _BOUNDS['sgbm'])
 
 
 def matcher(config: StereoConfig) -> Matcher:
@@ -190,6 +205,6 @@ def matcher(config: StereoConfig) -> Matcher:
     if config.matcher == 'sgbm':
         return semi_global_matcher(config.num_disparities, min(config.block_size, 7))
     if config.matcher == 'flow_fast':
-        return flow_matcher('ultrafast', 2)
-    flow = flow_matcher('fast', 1, smoothness=40.0)
+        return flow_matcher('ultrafast', 2, 20.0, _BOUNDS['flow_fast'])
+    flow = flow_matcher('fast', 1, 40.0, _BOUNDS['flow'])
     return hybrid_matcher(flow, block) if config.matcher == 'hybrid' else flow
