@@ -284,3 +284,48 @@ def test_estimate_is_the_same_for_the_same_seed():
     np.testing.assert_array_equal(a.rotation, b.rotation)
     np.testing.assert_array_equal(a.direction, b.direction)
     np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def distant_with_noise(rng: np.random.Generator, count: int, sigma: float,
+                       ) -> Correspondences:
+    """Points so far that only noise moves them: they fit every motion, ahead or behind."""
+    bearings = unit(rng.normal(size=(count, 3)))
+    return matches(unit(bearings + sigma * rng.normal(size=bearings.shape)), bearings)
+
+
+def joined(*parts: Correspondences) -> Correspondences:
+    return Correspondences(*(np.concatenate([getattr(p, name) for p in parts])
+                             for name in ('reference', 'current', 'sigma')))
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_the_points_that_moved_tell_the_sign_of_the_motion(seed):
+    rng = np.random.default_rng(seed)
+    position = unit([0.3, -0.6, 0.7])
+    near = correspondences(rng, 60, np.eye(3), position, near=5.0, far=30.0)
+    far = distant_with_noise(rng, 500, 4e-4)
+    # Noise that agrees on the wrong side.
+    turned = in_front(np.eye(3), position, far)
+    far = Correspondences(np.where(turned[:, None], far.current, far.reference),
+                          np.where(turned[:, None], far.reference, far.current), far.sigma)
+    found = ransac(joined(near, far), THRESHOLD, rng)
+    assert found is not None
+    assert found[1] @ position > 0
+
+
+@pytest.mark.parametrize('share', [0.2, 0.5])
+def test_points_behind_the_cameras_are_no_inliers(share):
+    rng = np.random.default_rng(3)
+    position = unit([0.0, 0.0, -1.0])
+    good = correspondences(rng, 1000, np.eye(3), position, noise=2e-4)
+    swap = np.arange(1000) < share * 1000  # they fit the plane, but went the other way
+    mixed = Correspondences(np.where(swap[:, None], good.current, good.reference),
+                            np.where(swap[:, None], good.reference, good.current), good.sigma)
+    got = estimate(mixed, PoseConfig())
+    if share < 1 / 3:
+        assert isinstance(got, PoseEstimate)
+        assert angle_between(got.direction, position) < np.radians(0.5)
+    else:
+        assert isinstance(got, Drop)
+        assert got.cause == 'too_few_inliers'
+        assert 'behind' in got.detail

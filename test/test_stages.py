@@ -23,9 +23,9 @@ from sphstereo_ros.core.frames import (
     RelativePose,
     StabilisedWindow,
 )
-from sphstereo_ros.core.stabilisation import Stabiliser, reduced
+from sphstereo_ros.core.stabilisation import Stabiliser, estimate, reduced
 from sphstereo_ros.core.stereo import SphericalStereo
-from sphstereo_ros.core.tracking import features, follow, spacing_for, track
+from sphstereo_ros.core.tracking import features, follow, match, spacing_for, track
 
 HEIGHT = 240
 ROOM = World()
@@ -222,6 +222,64 @@ def test_a_camera_turned_right_round_with_its_prior():
     rotation, direction = errors(pose, reference, current)
     assert rotation < 0.1
     assert direction < 1.0
+
+
+LARGE = {'nod': (0.6, 0, 0), 'yaw': (0, 1.5, 0), 'roll': (0, 0, -0.6), 'any': (0.5, 0.5, -0.3),
+         'upside down': (np.pi, 0, 0)}
+
+
+@pytest.mark.parametrize('turn', LARGE.values(), ids=LARGE)
+def test_a_large_rotation_that_nothing_foretells(turn):
+    current, reference = seen(), before('right', turn)
+    rotation, direction = errors(stabilised(current, reference), reference, current)
+    assert rotation < 0.1
+    assert direction < 1.0
+
+
+@pytest.mark.parametrize('turn', LARGE.values(), ids=LARGE)
+def test_a_large_rotation_on_the_spot_is_no_parallax(turn):
+    drop = stabilised(seen(), look(ROOM, (0, 0, 0), rotations.exp(turn), HEIGHT, noise=1.1))
+    assert isinstance(drop, Drop)
+    assert drop.cause == 'no_parallax'
+
+
+@pytest.mark.parametrize('step', [(0, 0, 1.2), (1.2, 0, 0), (0, -0.8, 0.8)])
+def test_a_large_step_is_found_where_tracking_fails(step):
+    current, reference = seen(), before(step, (0.02, -0.01, 0.01))
+    tracked = estimate(track(reference.image, current.image, np.eye(3), 2500), resolve({}).pose)
+    assert isinstance(tracked, Drop)
+    first = stabilised(current, reference)
+    rotation, direction = errors(first, reference, current)
+    assert rotation < 0.15
+    assert direction < 0.6
+    rotation, direction = errors(aligned(current, reference, first), reference, current)
+    assert rotation < 0.1
+    assert direction < 0.3
+
+
+def test_two_places_that_have_nothing_in_common_are_a_drop():
+    other = World((-3, -2.5, -7), (4, 1.9, 8), (), cell=0.5)
+    drop = stabilised(seen(), seen(other, (0.3, 0.1, 0.2)))
+    assert isinstance(drop, Drop)
+    assert drop.cause == 'too_few_inliers'
+
+
+def test_descriptors_match_over_the_seam_and_beside_the_mask():
+    current, reference = seen(), seen(turn=(0, 2.0, 0))
+    mask = np.zeros((HEIGHT, 2 * HEIGHT), np.uint8)
+    mask[:, :HEIGHT] = 255  # the left half
+    points = match(reference.image, current.image, 2500)
+    assert len(points) > 100
+    expected = points.reference @ reference.rotation.T
+    error = np.degrees(np.arccos(np.clip((expected * points.current).sum(axis=1), -1, 1)))
+    assert np.median(error) < 0.3
+    assert (error < 2).mean() > 0.95
+    half = match(reference.image, current.image, 2500, mask)
+    assert len(half) > 20
+    assert (half.current[:, 0] > 0).all()
+    assert (half.reference[:, 0] > 0).all()  # the vehicle is in the same place in both
+    blank = np.full_like(current.image, 90)
+    assert len(match(blank, current.image, 2500)) == len(match(current.image, blank, 2500)) == 0
 
 
 def test_length_and_its_uncertainty_come_from_the_prior():

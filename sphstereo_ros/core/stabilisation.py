@@ -46,12 +46,24 @@ def estimate(points: Correspondences, config: PoseConfig) -> PoseEstimate | Drop
     """
     if len(points) < config.min_inliers:
         return Drop('too_few_points', f'{len(points)} points with texture')
+    pose = _fitted(points, config)
+    return _judged(pose, points, config) if pose else _unfitted(points, config)
+
+
+def _fitted(points: Correspondences, config: PoseConfig) -> PoseEstimate | None:
     found = ransac(points, config.inlier_threshold, np.random.default_rng(config.seed))
-    pose = refine(*found, points) if found else None
-    if pose is None:
-        if np.median(parallax(rotation_between(points), points)) < config.min_parallax:
-            return Drop('no_parallax', 'a rotation explains all correspondences')
-        return Drop('too_few_inliers', 'no pose fits the correspondences')
+    return refine(*found, points) if found else None
+
+
+def _unfitted(points: Correspondences, config: PoseConfig) -> Drop:
+    if np.median(parallax(rotation_between(points), points)) < config.min_parallax:
+        return Drop('no_parallax', 'a rotation explains all correspondences')
+    return Drop('too_few_inliers', 'no pose fits the correspondences')
+
+
+def _judged(pose: PoseEstimate, points: Correspondences,
+            config: PoseConfig) -> PoseEstimate | Drop:
+    """The pose, if enough points that moved bear it out."""
     # The robust loss adapts its width to the residuals, so inliers are counted by the threshold.
     residual = np.abs(epipolar_residuals(pose.rotation, pose.direction, points))
     inliers = pose.inliers & (residual < config.inlier_threshold)
@@ -118,15 +130,17 @@ class Stabiliser:
         """
         config = self.config
         points = match(reference, current, config.max_points, mask)
-        coarse = estimate(points, config)
-        if isinstance(coarse, Drop):
-            return first if coarse.cause == 'too_few_points' else coarse
-        again = estimate(track(reference, current, coarse.rotation, config.max_points, mask),
-                         config)
-        if not isinstance(again, Drop) or again.cause == 'no_parallax':
+        if len(points) < config.min_inliers:
+            return first
+        coarse = _fitted(points, config)
+        turn = coarse.rotation if coarse else rotation_between(points)
+        again = estimate(track(reference, current, turn, config.max_points, mask), config)
+        if coarse is None or isinstance(again, PoseEstimate) or again.cause == 'no_parallax':
             return again
         moved = np.median(parallax(coarse.rotation, points[coarse.inliers]))
-        return coarse if moved > _COARSE * config.inlier_threshold else again
+        if moved < _COARSE * config.inlier_threshold:
+            return again
+        return _judged(coarse, points, config)
 
     def _mask_like(self, image: NDArray[np.uint8]) -> Image8 | None:
         if self._mask is None:
