@@ -76,10 +76,11 @@ def test_fixed_length_counts_frames() -> None:
 
 
 def test_fixed_without_length_is_a_direction_only() -> None:
-    pose = priors().between(0, 99, 5)
-    assert isinstance(pose, RelativePose)
-    assert not pose.is_metric
-    np.testing.assert_array_equal(pose.position, [0, 0, -UNSCALED])
+    for frames in (1, 5, 100):
+        pose = priors().between(0, 99, frames)
+        assert isinstance(pose, RelativePose)
+        assert not pose.is_metric
+        np.testing.assert_allclose(pose.position, [0, 0, -frames * UNSCALED], rtol=1e-12)
 
 
 def test_speed_counts_time() -> None:

@@ -205,7 +205,7 @@ def test_frames_kept_are_bounded() -> None:
     assert len(p._frames) == MAX_FRAMES
     p.configure(resolve({'pairing.intervals': (2,)}))
     assert len(p._frames) == 2
-    assert window(p.add_frame(frame(999))) == (999, [(MAX_FRAMES + 48, 1e-6)])
+    assert window(p.add_frame(frame(999))) == (999, [(MAX_FRAMES + 48, 2e-6)])
 
 
 def test_the_pose_follows_parameters_at_run_time() -> None:

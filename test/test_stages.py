@@ -564,6 +564,24 @@ def test_two_baselines_are_better_than_the_short_one_alone():
     assert np.median(fused.sigma[known]) < 0.8 * np.median(alone.sigma[known])
 
 
+def test_without_metres_two_baselines_fuse_alike():
+    """Also where only the long one knows the range: its unit is the short one's."""
+    current = seen()
+    views = [before('forward'), before((0, 0, 1.12))]
+    half = views[0].image.copy()
+    half[:, :HEIGHT] = 128  # the short pair knows nothing of the left half
+    views[0] = with_image(views[0], half)
+    metric = measured(current, *((v, exact(v, current)) for v in views))
+    unscaled = measured(current, *(
+        (v, replace(exact(v, current), covariance=None,
+                    position=UNSCALED / 0.28 * true_pose(v, current).position)) for v in views))
+    assert not unscaled.is_metric
+    left = np.isfinite(metric.range) & np.isfinite(unscaled.range)
+    left[:, HEIGHT:] = False
+    assert left.sum() > 0.3 * HEIGHT**2
+    np.testing.assert_allclose(0.28 * unscaled.range[left], metric.range[left], rtol=0.01)
+
+
 def test_baselines_with_and_without_metres_do_not_mix():
     current, reference = seen(), before('forward')
     pose = exact(reference, current)

@@ -241,9 +241,10 @@ class MotionPriors:
         """
         source = self._config.source
         if source == 'fixed':
-            return self._assumed(earlier, later, self._config.length * frames)
+            return self._assumed(earlier, later, (self._config.length or UNSCALED) * frames)
         if source == 'speed':
-            return self._assumed(earlier, later, self._config.speed * (later - earlier) / SECOND)
+            length = self._config.speed * (later - earlier) / SECOND
+            return self._assumed(earlier, later, length or UNSCALED * frames)
         pose = self._by_odometry(earlier, later)
         if source == 'twist':
             pose = self._by_twist(earlier, later, pose)
@@ -254,10 +255,10 @@ class MotionPriors:
         return pose
 
     def _assumed(self, earlier: int, later: int, length: float) -> RelativePose:
-        """Forward by `length`, or an unknown length where that is 0."""
+        """Forward by `length`."""
         pose = self._by_odometry(earlier, later)
         rotation = self._imu_rotation(earlier, later) if pose is None else pose.rotation
-        return RelativePose(rotation, np.array([0.0, 0.0, -(length or UNSCALED)]))
+        return RelativePose(rotation, np.array([0.0, 0.0, -length]))
 
     def _by_odometry(self, earlier: int, later: int) -> RelativePose | None:
         a = interpolate_odometry(self._odometry, earlier)

@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 
 Image8 = NDArray[np.uint8]
 
-# Distance that stands for "direction known, length unknown", in metres: far under any real
-# baseline, so that range computed from it by mistake is absurdly near, never far.
+# Distance between consecutive frames that stands for "direction known, length unknown", in metres:
+# far under any real baseline, so that range computed from it by mistake is absurdly near, never
+# far. A reference k frames back is k times as far away; so far back they still are unscaled.
 UNSCALED = 1e-6
+_LEAST_METRIC = 1000 * UNSCALED
 
 
 @dataclass(frozen=True, order=True)
@@ -47,7 +49,7 @@ class RelativePose:
     """Pose of a reference camera in the current camera's optical frame.
 
     rotation : (3, 3), X_current = rotation · X_reference + position
-    position : (3,), metres; of length UNSCALED when only its direction is known
+    position : (3,), metres; in units of UNSCALED when the length of a step is not known
     covariance : (6, 6) of a small rotation (rad, about the current axes), then of the position
         (m); None where nothing is known of it
     """
@@ -64,7 +66,7 @@ class RelativePose:
     @property
     def is_metric(self) -> bool:
         """Whether the length of `position` is in metres (else it is only a direction)."""
-        return self.baseline > 10 * UNSCALED
+        return self.baseline > _LEAST_METRIC
 
     @property
     def direction(self) -> NDArray[np.float64]:
@@ -117,8 +119,8 @@ class Drop:
 class RangeImage:
     """Radial range on the current frame's equirectangular grid (H, 2H).
 
-    range : float32 metres (baselines, if not `is_metric`): NaN unknown, +Inf confidently beyond
-        the maximum, −Inf nearer than the minimum (REP-117)
+    range : float32 metres (steps between frames, if not `is_metric`): NaN unknown, +Inf
+        confidently beyond the maximum, −Inf nearer than the minimum (REP-117)
     sigma : float32, one standard deviation of it, same unit; NaN where range is not finite
     """
 

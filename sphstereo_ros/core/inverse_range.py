@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import RangeConfig
-from .frames import Image8, RelativePose
+from .frames import UNSCALED, Image8, RelativePose
 from .jit import fast_kernel, kernel, rows_in_parallel
 from .matching import Parallax
 from .warp import Map, PolarGrid, _arctan2
@@ -145,13 +145,14 @@ def inverse_range(parallax: Parallax, grid: PolarGrid, axes: Floats, pose: Relat
     ----------
     parallax : on `grid`
     axes : polar axes (3, 3) of the current view
-    pose : of the reference; ρ is in 1/baselines where it is not metric
+    pose : of the reference; ρ is per step between frames where it is not metric
     baseline_sigma : relative standard deviation of the baseline where the pose tells none
 
     """
     rotation_sigma, direction_sigma, known_sigma = pose_sigmas(pose)
-    noise = np.array([pose.baseline if pose.is_metric else 1.0, rotation_sigma, direction_sigma,
-                      known_sigma or baseline_sigma], np.float32)
+    baseline = pose.baseline if pose.is_metric else pose.baseline / UNSCALED
+    noise = np.array([baseline, rotation_sigma, direction_sigma, known_sigma or baseline_sigma],
+                     np.float32)
     rho, sigma = (np.empty((height, 2 * height), np.float32) for _ in range(2))
     pixel, margin, wrap = (np.float32(n) for n in (grid.pixel, grid.margin, grid.wrap))
     rows_in_parallel(_rows, height, *_grid_angles(height), np.ascontiguousarray(axes, np.float32),

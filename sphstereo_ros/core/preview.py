@@ -6,7 +6,7 @@ import numpy as np
 
 from .frames import Image8, RangeImage
 
-NEAR, FAR = 0.5, 100.0  # ends of the colour scale, metres (or baselines · 0.3)
+NEAR, FAR = 0.5, 100.0  # ends of the colour scale, metres (or steps · 0.3)
 _UNKNOWN, _BEYOND, _TOO_NEAR = (24, 24, 24), (90, 60, 40), (255, 255, 255)  # BGR
 
 
@@ -14,7 +14,7 @@ def colour_map(range_image: RangeImage) -> Image8:
     """Colours (H, 2H, 3) BGR: red near to blue far on a logarithmic scale of NEAR … FAR metres.
 
     Unknown is nearly black, beyond the maximum is slate, nearer than the minimum is white.
-    Without metric scale a baseline counts as 0.3 m.
+    Without metric scale a step between frames counts as 0.3 m.
     """
     r = range_image.range if range_image.is_metric else range_image.range * np.float32(0.3)
     finite = np.isfinite(r)
