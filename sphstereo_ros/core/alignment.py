@@ -14,7 +14,7 @@ from .config import AlignmentConfig, Config
 from .frames import AlignedWindow, Drop, Frame, Image8, Reference, RelativePose, StabilisedWindow
 from .paper import window_ratio_direction
 from .relative_pose import Correspondences, PoseEstimate, epipolar_residuals, refine
-from .sphere import polar_angles, polar_bearings
+from .sphere import polar_bearings
 from .stabilisation import reduced, with_length
 from .tracking import Points, features, follow, spacing_for
 from .warp import PolarGrid, aligned_pair
@@ -22,29 +22,22 @@ from .warp import PolarGrid, aligned_pair
 Floats = NDArray[np.float64]
 
 _MARGIN, _WRAP = 8, 8
+_WINDOW = 15
 _POLE = 0.1  # rad round both poles, where the grid is too stretched to track
 
 
 def aligned_correspondences(reference: Image8, current: Image8, pose: RelativePose,
-                            grid: PolarGrid, count: int,
-                            again: Correspondences | None = None) -> Correspondences:
+                            grid: PolarGrid, count: int) -> Correspondences:
     """Features followed between the views on the polar grid, back as bearings of each view.
 
-    count : so many features at most, about; or the features of `again` are followed once more
+    count : so many features at most, about
     """
     ref, cur, axes = aligned_pair(reference, current, pose, grid)
+    inside = np.zeros(grid.shape, bool)
+    inside[grid.wrap:-grid.wrap, np.sin(grid.theta()) > np.sin(_POLE)] = True
+    points, sigma = features(cur, spacing_for(count, grid.height), inside)
+    moved, found = follow(cur, ref, points, window=_WINDOW)
     offset = np.array([grid.margin, grid.wrap]) - 0.5
-    if again is None:
-        inside = np.zeros(grid.shape, bool)
-        inside[grid.wrap:-grid.wrap, np.sin(grid.theta()) > np.sin(_POLE)] = True
-        points, sigma = features(cur, spacing_for(count, grid.height), inside)
-        expected = None
-    else:
-        points = polar_angles(again.current, axes) / grid.pixel + offset
-        expected = polar_angles(again.reference @ pose.rotation.T, axes) / grid.pixel + offset
-        expected[:, 1] = nearest_turn(expected[:, 1], points[:, 1], 2 * grid.height)
-        sigma = again.sigma / grid.pixel
-    moved, found = follow(cur, ref, points, expected=expected)
 
     def bearings(pixels: Points) -> Floats:
         theta, azimuth = ((pixels[found] - offset) * grid.pixel).T
@@ -52,11 +45,6 @@ def aligned_correspondences(reference: Image8, current: Image8, pose: RelativePo
 
     return Correspondences(bearings(moved) @ pose.rotation, bearings(points),
                            sigma[found] * grid.pixel)
-
-
-def nearest_turn(rows: Floats, to: Floats, period: int) -> Floats:
-    """The rows, whole turns of `period` added, that are nearest to `to`."""
-    return np.asarray(to + (rows - to + period / 2) % period - period / 2)
 
 
 class Aligner:
@@ -90,10 +78,10 @@ class Aligner:
             pose = window_ratio_direction(images[0], images[1], reference.pose)
             return replace(reference, pose=pose) if isinstance(pose, RelativePose) else pose
         grid = PolarGrid(height, _MARGIN, _WRAP)
-        pose, points = reference.pose, None
+        pose = reference.pose
         for _ in range(self.config.iterations):
             points = aligned_correspondences(images[0], images[1], pose, grid,
-                                             self.config.max_points, points)
+                                             self.config.max_points)
             refined = self._refined(points, pose, grid.pixel)
             if isinstance(refined, Drop):
                 return refined

@@ -147,11 +147,11 @@ class AlignmentConfig:
     method: str = _p('alignment.method', 'refined', 'refined: features of the aligned pair; '
                      "paper: the window-ratio estimator of the paper's section 3.1",
                      choices=('refined', 'paper'))
-    working_height: int = _p('alignment.working_height', 640, 'polar height of the reduced '
+    working_height: int = _p('alignment.working_height', 864, 'polar height of the reduced '
                              'aligned copy', unit='px', low=60, high=4096)
     max_points: int = _p('alignment.max_points', 4000, 'features followed, about', low=200,
                          high=100000)
-    iterations: int = _p('alignment.iterations', 2, 'refinements', low=0, high=10)
+    iterations: int = _p('alignment.iterations', 1, 'refinements', low=0, high=10)
     rotation_sigma: float = _p('alignment.rotation_sigma', 0.005 * math.pi / 180,
                                'least standard deviation of a refined rotation', unit='rad',
                                low=0.0, high=0.1)

@@ -21,7 +21,7 @@ Points = NDArray[np.floating]
 # floor that better structure does not lower, and the worst that is worth following (px).
 _BLOCK = 5
 _GREY_SQUARED = (4 * 255 * _BLOCK / 8 / _BLOCK)**2 / 4
-_NOISE, _FLOOR, _WORST = 1.5 / 11, 0.05, 0.5
+_NOISE, _FLOOR, _WORST = 1.5 / 11, 0.1, 0.5
 
 # Descriptors: the nearest must be nearer than the second by this factor; error of a match (px).
 _DISTINCT, _MATCHED = 0.8, 0.5
@@ -66,20 +66,14 @@ def features(image: Image8, spacing: int,
     return np.stack([u[keep], v[keep]], axis=1).astype(np.float32), sigma[keep].astype(float)
 
 
-def follow(source: Image8, target: Image8, points: Points, *, expected: Points | None = None,
-           window: int = 11, levels: int = 3) -> tuple[Points, NDArray[np.bool_]]:
-    """Pyramidal Lucas–Kanade: where `points` (N, 2) of `source` are in `target`, and if found.
-
-    expected : (N, 2), where they are to a pixel or so: no pyramid is needed then
-    """
+def follow(source: Image8, target: Image8, points: Points, *, window: int = 11,
+           levels: int = 3) -> tuple[Points, NDArray[np.bool_]]:
+    """Pyramidal Lucas–Kanade: where `points` (N, 2) of `source` are in `target`, and if found."""
     if not len(points):
         return points, np.zeros(0, bool)
-    start = None if expected is None else np.array(expected[:, None], np.float32)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        source, target, np.asarray(points[:, None], np.float32), start,
-        winSize=(window, window), maxLevel=levels if expected is None else 0,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.003),
-        flags=0 if expected is None else cv2.OPTFLOW_USE_INITIAL_FLOW)
+        source, target, points[:, None], None, winSize=(window, window), maxLevel=levels,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.003))
     return found[:, 0], status[:, 0].astype(bool)
 
 
