@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from . import relative_pose
 from .config import AlignmentConfig, Config
 from .frames import AlignedWindow, Drop, Frame, Image8, Reference, RelativePose, StabilisedWindow
 from .paper import window_ratio_direction
@@ -59,6 +60,7 @@ class Aligner:
         noise = np.random.default_rng(0).integers(0, 255, (64, 128), np.uint8)
         pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -1.0]))
         aligned_correspondences(noise, noise, pose, PolarGrid(64, _MARGIN, _WRAP), 500)
+        relative_pose.warm_up()
 
     def process(self, window: StabilisedWindow) -> AlignedWindow | Drop:
         """Refine every reference's pose; those that fail are left out.

@@ -210,6 +210,14 @@ def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iter
                         scale * float(np.median(points.sigma)))
 
 
+def warm_up() -> None:
+    """Compile what `refine` needs."""
+    bearings = np.random.default_rng(0).normal(size=(2, 20, 3))
+    bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
+    refine(np.eye(3), np.array([0.0, 0.0, -1.0]),
+           Correspondences(bearings[0], bearings[1], np.full(20, 1e-3)), iterations=1)
+
+
 def _spread(direction: Floats) -> Floats:
     """(6, 5): a small rotation and two angles of the direction → rotation and direction."""
     spread = np.zeros((6, 5))

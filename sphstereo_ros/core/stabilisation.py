@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from . import relative_pose
 from .config import Config, PoseConfig
 from .frames import (
     Drop,
@@ -95,6 +96,7 @@ class Stabiliser:
         """Compile what `process` needs."""
         noise = np.random.default_rng(0).integers(0, 255, (64, 128), np.uint8)
         track(noise, noise, np.diag([-1.0, 1, -1]), 200)
+        relative_pose.warm_up()
 
     def process(self, window: PairedWindow) -> StabilisedWindow | Drop:
         """Give every reference its rotation and direction; the baselines' lengths stay.
