@@ -13,14 +13,17 @@ from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import Frame, FrameKey, Image8
 from sphstereo_ros.core.warp import PolarGrid, aligned_pair
 
+# Frames (H, 2H) of a moving camera, or one array (N, H, 2H) of them.
+Images = Sequence[Image8] | Image8
 
-def to_and_fro(images: Sequence[Image8], count: int) -> list[Image8]:
+
+def to_and_fro(images: Images, count: int) -> list[Image8]:
     """`count` images, forward then backward and so on, so that motion stays continuous."""
     cycle = [*images, *images[-2:0:-1]] if len(images) > 2 else list(images)
     return [cycle[i % len(cycle)] for i in range(count)]
 
 
-def measure(images: Sequence[Image8], parameters: dict[str, object], pairs: int,
+def measure(images: Images, parameters: dict[str, object], pairs: int,
             ) -> dict[str, Any]:
     """Time the whole chain for each new frame, and StereoBM(96, 15) on the pair it aligned.
 
@@ -60,7 +63,7 @@ def measure(images: Sequence[Image8], parameters: dict[str, object], pairs: int,
             'pairs': len(times['chain_ms']), 'dropped': dropped}
 
 
-def stage_times(images: Sequence[Image8], parameters: dict[str, object],
+def stage_times(images: Images, parameters: dict[str, object],
                 pairs: int = 20) -> dict[str, float]:
     """Median milliseconds of each stage."""
     chain = Chain(resolve({'baseline.length': 0.28, **parameters}))
