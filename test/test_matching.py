@@ -6,6 +6,7 @@ from analytic_world import _noise
 
 from sphstereo_ros.core.config import PARAMETERS, StereoConfig
 from sphstereo_ros.core.matching import (
+    MARGIN,
     UNKNOWN,
     Matcher,
     Parallax,
@@ -77,7 +78,7 @@ def test_the_first_columns_are_not_lost(name):
     first = found.pixels[20:-20, 20:96]
     assert (np.abs(first - 3.0) < 0.3).mean() > 0.8
     rim = found.pixels[:, 20:-20]
-    assert (np.abs(rim[[1, -2]] - 3.0) < 0.5).mean() > 0.5
+    assert (np.abs(rim[[MARGIN, -MARGIN - 1]] - 3.0) < 0.5).mean() > 0.5
 
 
 @pytest.mark.parametrize('name', [m for m in MATCHERS if m not in ONE_SIDED])

@@ -11,7 +11,8 @@ import numpy as np
 from sphstereo_ros.core.chain import Chain, StageResults
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import Frame, FrameKey, Image8
-from sphstereo_ros.core.warp import PolarGrid, aligned_pair
+from sphstereo_ros.core.stereo import stereo_grid
+from sphstereo_ros.core.warp import aligned_pair
 
 # Frames (H, 2H) of a moving camera, or one array (N, H, 2H) of them.
 Images = Sequence[Image8] | Image8
@@ -52,7 +53,7 @@ def measure(images: Images, parameters: dict[str, object], pairs: int,
             continue
         reference = outcome.aligned.references[0]
         views = aligned_pair(reference.frame.image, image, reference.pose,
-                             PolarGrid(image.shape[0]))
+                             stereo_grid(image.shape[0]))
         start = time.perf_counter()
         block_matcher.compute(views[1], views[0])
         if index > 5:

@@ -23,7 +23,6 @@ from .warp import PolarGrid, aligned_pair
 Floats = NDArray[np.float64]
 
 _MARGIN, _WRAP = 8, 8
-_WINDOW = 15
 _POLE = 0.1  # rad round both poles, where the grid is too stretched to track
 
 
@@ -37,7 +36,7 @@ def aligned_correspondences(reference: Image8, current: Image8, pose: RelativePo
     inside = np.zeros(grid.shape, bool)
     inside[grid.wrap:-grid.wrap, np.sin(grid.theta()) > np.sin(_POLE)] = True
     points, sigma = features(cur, spacing_for(count, grid.height), inside)
-    moved, found = follow(cur, ref, points, window=_WINDOW)
+    moved, found = follow(cur, ref, points)
     offset = np.array([grid.margin, grid.wrap]) - 0.5
 
     def bearings(pixels: Points) -> Floats:
@@ -75,7 +74,9 @@ class Aligner:
 
     def _reference(self, current: Frame, reference: Reference) -> Reference | Drop:
         height = min(self.config.working_height, current.image.shape[0])
-        images = [reduced(f.image, height) for f in (reference.frame, current)]
+        # Shrinking by a little only blurs: the grid samples the frame itself then.
+        images = [f.image if f.image.shape[0] < 1.3 * height else reduced(f.image, height)
+                  for f in (reference.frame, current)]
         if self.config.method == 'paper':
             pose = window_ratio_direction(images[0], images[1], reference.pose)
             return replace(reference, pose=pose) if isinstance(pose, RelativePose) else pose

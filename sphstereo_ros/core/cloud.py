@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from .camera import Equirectangular
 from .config import CameraConfig, Config
 from .frames import Frame, PointCloud, RangeImage
+from .jit import kernel
 from .rotations import mount
 
 MAX_BYTES = 8_000_000
@@ -39,13 +40,28 @@ def point_cloud(range_image: RangeImage, frame: Frame, config: Config) -> PointC
     height = range_image.range.shape[0]
     stride = config.points.stride or default_stride(height)
     thin = (slice(None, None, stride), slice(None, None, stride))
-    r = range_image.range[thin].ravel()
-    known = np.flatnonzero(np.isfinite(r))
-    xyz = _bearings(height, stride, config.camera)[known]
-    xyz *= r[known, None]
-    xyz += mount(config.camera).position.astype(np.float32)
+    r = np.ascontiguousarray(range_image.range[thin]).ravel()
+    position = mount(config.camera).position.astype(np.float32)
+    xyz, known = np.empty((r.size, 3), np.float32), np.empty(r.size, np.intp)
+    count = _place(r, _bearings(height, stride, config.camera), position, xyz, known)
+    known = known[:count]
     sigma = range_image.sigma[thin].ravel()[known]
     if config.points.colour and frame.colour is not None:
         bgr = frame.colour[thin].reshape(-1, 3)[known]
-        return PointCloud(range_image.key, xyz, sigma, bgr=bgr)
-    return PointCloud(range_image.key, xyz, sigma, frame.image[thin].ravel()[known])
+        return PointCloud(range_image.key, xyz[:count], sigma, bgr=bgr)
+    return PointCloud(range_image.key, xyz[:count], sigma, frame.image[thin].ravel()[known])
+
+
+@kernel
+def _place(r: NDArray[np.float32], bearings: NDArray[np.float32], position: NDArray[np.float32],
+           xyz: NDArray[np.float32],
+           known: NDArray[np.intp]) -> int:  # pragma: no cover - compiled
+    """Points of the finite ranges, packed; how many, and where they come from in `known`."""
+    count = 0
+    for i in range(r.size):
+        if np.isfinite(r[i]):
+            for axis in range(3):
+                xyz[count, axis] = bearings[i, axis] * r[i] + position[axis]
+            known[count] = i
+            count += 1
+    return count

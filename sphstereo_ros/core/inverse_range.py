@@ -179,7 +179,7 @@ def fuse(estimates: list[InverseRange]) -> InverseRange:
     Where a longer baseline contradicts what is already there, it is wrong as a rule (its search or
     its occlusions): the shorter one's estimate stays.
     """
-    rho, sigma, signed = estimates[0].rho.copy(), estimates[0].sigma.copy(), estimates[0].signed
+    rho, sigma, signed = estimates[0].rho, estimates[0].sigma, estimates[0].signed
     for more in estimates[1:]:
         agrees = np.abs(more.rho - rho) < _CONFIDENT * np.hypot(more.sigma, sigma)
         w0, w1 = 1 / sigma**2, 1 / more.sigma**2

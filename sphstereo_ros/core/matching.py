@@ -22,6 +22,9 @@ Pixels = NDArray[np.float32]
 
 Bounds = tuple[float, float]
 
+# Pixels round an aligned pair that need not be matched: they are there for windows to see.
+MARGIN = 8
+
 UNKNOWN = -1e5  # more than a turn at any size
 
 
@@ -60,9 +63,9 @@ def structure(image: Image8, window: int = 9) -> Pixels:
     It varies slowly, so half of the rows and columns are enough.
     """
     half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    gradient = cv2.Sobel(half, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 16)
-    squared = cv2.multiply(gradient, gradient, dst=gradient)
-    return np.asarray(cv2.sqrt(cv2.boxFilter(squared, -1, (window, window))))
+    gradient = cv2.Sobel(half, cv2.CV_16S, 1, 0, ksize=3)
+    squared = cv2.sqrBoxFilter(gradient, cv2.CV_32F, (window, window))
+    return np.asarray(cv2.sqrt(squared)) * np.float32(1 / 16)
 
 
 def structure_sigma(image: Image8, bounds: Bounds) -> Pixels:
@@ -168,13 +171,18 @@ def _from_fixed_point(first: int, last: int, disparity: NDArray[np.int16],
 
 
 def _opencv_matcher(stereo: Any, disparities: int, block: int, bounds: Bounds) -> Matcher:
-    """A StereoBM or StereoSGBM, padded: it leaves the first columns and the rim empty."""
-    left, rim = disparities + block // 2, block // 2
+    """A StereoBM or StereoSGBM, padded: it leaves the first columns and the rim empty.
+
+    Only what the margin of the pair does not cover already is added.
+    """
+    rim = max(block // 2 - MARGIN, 0)
+    left = disparities + block // 2 - MARGIN
 
     def match(current: Image8, reference: Image8) -> Parallax:
         padded = [cv2.copyMakeBorder(im, rim, rim, left, rim, cv2.BORDER_REPLICATE)
                   for im in (current, reference)]
-        disparity = stereo.compute(*padded)[rim:-rim, left:-rim]
+        rows, columns = current.shape
+        disparity = stereo.compute(*padded)[rim:rim + rows, left:left + columns]
         pixels = np.empty(current.shape, np.float32)
         rows_in_parallel(_from_fixed_point, len(pixels), disparity, pixels)
         return Parallax(pixels, structure_sigma(current, bounds), signed=False)

@@ -94,13 +94,16 @@ def in_front(rotation: Floats, direction: Floats, points: Correspondences) -> ND
     return np.asarray(((b * c - a) > 0) & ((b - a * c) > 0))
 
 
-def _best_model(models: Floats, points: Correspondences, threshold: float) -> tuple[Floats, float]:
+def _best_model(models: Floats, points: Correspondences,
+                threshold: float) -> tuple[Floats, float, float]:
+    """The model of least MSAC cost, that cost, and its share of inliers."""
     normal = models @ points.reference.T  # (M, 3, N)
     squared = (normal * points.current.T).sum(axis=1)**2 / np.maximum(
         (normal * normal).sum(axis=1), 1e-18)
-    cost = np.minimum(squared / threshold**2, 1.0).mean(axis=1)  # MSAC
+    ratio = squared / threshold**2
+    cost = np.minimum(ratio, 1.0).mean(axis=1)
     best = int(np.argmin(cost))
-    return models[best], float(cost[best])
+    return models[best], float(cost[best]), float((ratio[best] < 1).mean())
 
 
 def ransac(points: Correspondences, threshold: float, rng: np.random.Generator, *,
@@ -110,7 +113,8 @@ def ransac(points: Correspondences, threshold: float, rng: np.random.Generator, 
 
     Parameters
     ----------
-    points : at least five correspondences
+    points : at least five correspondences; samples are drawn from the half that is expected to be
+        followed best
     threshold : angular residual of an inlier, rad
     rng : decides the samples
     batch, max_batches : samples at a time, and how often at most
@@ -118,18 +122,18 @@ def ransac(points: Correspondences, threshold: float, rng: np.random.Generator, 
     confidence : that one sample without outliers was drawn
 
     """
-    subset = points[rng.permutation(len(points))[:scored]]
+    pool = points[points.sigma <= np.median(points.sigma)]
+    subset = pool[rng.permutation(len(pool))[:scored]]
     best: Floats | None = None
-    lowest = np.inf
+    lowest, inliers = np.inf, 0.0
     for tried in range(1, max_batches + 1):
-        sample = rng.integers(0, len(points), (batch, 5))
-        models = essential_matrices(points.reference[sample], points.current[sample])
+        sample = rng.integers(0, len(pool), (batch, 5))
+        models = essential_matrices(pool.reference[sample], pool.current[sample])
         if len(models):
-            model, cost = _best_model(models, subset, threshold)
+            model, cost, share = _best_model(models, subset, threshold)
             if cost < lowest:
-                best, lowest = model, cost
-        # The MSAC cost is at least the share of outliers, so this asks for enough samples.
-        if (1 - max(1 - lowest, 0.0)**5)**(tried * batch) < 1 - confidence:
+                best, lowest, inliers = model, cost, share
+        if (1 - inliers**5)**(tried * batch) < 1 - confidence:
             break
     if best is None:
         return None

@@ -16,10 +16,13 @@ from .frames import (
     RelativePose,
 )
 from .inverse_range import InverseRange, fuse, inverse_range, published_range
-from .matching import matcher
+from .matching import MARGIN, matcher
 from .warp import PolarGrid, aligned_pair
 
-_MARGIN, _WRAP = 8, 8  # even, for the half-size sigma
+
+def stereo_grid(height: int) -> PolarGrid:
+    """The grid on which frames of `height` rows are matched."""
+    return PolarGrid(height, MARGIN, MARGIN)
 
 
 class SphericalStereo:
@@ -55,7 +58,7 @@ class SphericalStereo:
 
     def _measure(self, current: Frame, reference: Reference) -> InverseRange:
         height = current.image.shape[0]
-        grid = PolarGrid(height, _MARGIN, _WRAP)
+        grid = stereo_grid(height)
         ref, cur, axes = aligned_pair(reference.frame.image, current.image, reference.pose, grid)
         parallax = self._match(cur, ref)
         return inverse_range(parallax, grid, axes, reference.pose, height,

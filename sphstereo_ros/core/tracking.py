@@ -20,8 +20,9 @@ Points = NDArray[np.floating]
 # in squared grey levels per full-size pixel, the image's noise over a window of 11 pixels, the
 # floor that better structure does not lower, and the worst that is worth following (px).
 _BLOCK = 5
+_WINDOW = 11
 _GREY_SQUARED = (4 * 255 * _BLOCK / 8 / _BLOCK)**2 / 4
-_NOISE, _FLOOR, _WORST = 1.5 / 11, 0.1, 0.5
+_NOISE, _FLOOR, _WORST = 1.5 / _WINDOW, 0.1, 0.5
 
 # Descriptors: the nearest must be nearer than the second by this factor; error of a match (px).
 _DISTINCT, _MATCHED = 0.8, 0.5
@@ -66,13 +67,13 @@ def features(image: Image8, spacing: int,
     return np.stack([u[keep], v[keep]], axis=1).astype(np.float32), sigma[keep].astype(float)
 
 
-def follow(source: Image8, target: Image8, points: Points, *, window: int = 11,
+def follow(source: Image8, target: Image8, points: Points, *,
            levels: int = 3) -> tuple[Points, NDArray[np.bool_]]:
     """Pyramidal Lucas–Kanade: where `points` (N, 2) of `source` are in `target`, and if found."""
     if not len(points):
         return points, np.zeros(0, bool)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        source, target, points[:, None], None, winSize=(window, window), maxLevel=levels,
+        source, target, points[:, None], None, winSize=(_WINDOW, _WINDOW), maxLevel=levels,
         criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.003))
     return found[:, 0], status[:, 0].astype(bool)
 

@@ -61,13 +61,15 @@ def with_border(image: NDArray[Any]) -> NDArray[Any]:
 
     Beyond a pole the sphere goes on half a turn away, upside down.
     """
-    wide = cv2.copyMakeBorder(image, 0, 0, BORDER, BORDER, cv2.BORDER_WRAP)
-    out = cv2.copyMakeBorder(wide, BORDER, BORDER, 0, 0, cv2.BORDER_REPLICATE)
-    half = np.roll(np.arange(image.shape[1]), -(image.shape[1] // 2))
-    columns = np.pad(half, BORDER, mode='wrap')
+    height, width = image.shape[:2]
+    out = np.empty((height + 2 * BORDER, width + 2 * BORDER, *image.shape[2:]), image.dtype)
+    out[BORDER:-BORDER, BORDER:-BORDER] = image
+    out[BORDER:-BORDER, :BORDER] = image[:, -BORDER:]
+    out[BORDER:-BORDER, -BORDER:] = image[:, :BORDER]
+    columns = (np.arange(width + 2 * BORDER) - BORDER + width // 2) % width
     out[:BORDER] = image[BORDER - 1::-1][:, columns]
     out[-BORDER:] = image[:-BORDER - 1:-1][:, columns]
-    return np.asarray(out)
+    return out
 
 
 @fast_kernel
