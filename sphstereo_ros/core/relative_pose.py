@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from . import rotations
 from .five_point import decompose, essential_matrices
-from .jit import kernel
+from .jit import fast_kernel, kernel
 
 Floats = NDArray[np.float64]
 
@@ -94,16 +94,36 @@ def in_front(rotation: Floats, direction: Floats, points: Correspondences) -> ND
     return np.asarray(((b * c - a) > 0) & ((b - a * c) > 0))
 
 
+@fast_kernel
+def _judge(models: Floats, reference: Floats, current: Floats, threshold: float, cost: Floats,
+           share: Floats) -> None:  # pragma: no cover - compiled
+    """MSAC cost and share of inliers of each model (M, 3, 3); bearings are (3, N)."""
+    count = reference.shape[1]
+    for m in range(len(models)):
+        e = models[m]
+        total, inliers = 0.0, 0
+        for k in range(count):
+            x, y, z = reference[0, k], reference[1, k], reference[2, k]
+            nx = e[0, 0] * x + e[0, 1] * y + e[0, 2] * z
+            ny = e[1, 0] * x + e[1, 1] * y + e[1, 2] * z
+            nz = e[2, 0] * x + e[2, 1] * y + e[2, 2] * z
+            across = nx * current[0, k] + ny * current[1, k] + nz * current[2, k]
+            ratio = across * across / (threshold * threshold
+                                       * max(nx * nx + ny * ny + nz * nz, 1e-18))
+            total += min(ratio, 1.0)
+            inliers += ratio < 1.0
+        cost[m] = total / count
+        share[m] = inliers / count
+
+
 def _best_model(models: Floats, points: Correspondences,
                 threshold: float) -> tuple[Floats, float, float]:
     """The model of least MSAC cost, that cost, and its share of inliers."""
-    normal = models @ points.reference.T  # (M, 3, N)
-    squared = (normal * points.current.T).sum(axis=1)**2 / np.maximum(
-        (normal * normal).sum(axis=1), 1e-18)
-    ratio = squared / threshold**2
-    cost = np.minimum(ratio, 1.0).mean(axis=1)
+    cost, share = np.empty(len(models)), np.empty(len(models))
+    _judge(models, np.ascontiguousarray(points.reference.T),
+           np.ascontiguousarray(points.current.T), threshold, cost, share)
     best = int(np.argmin(cost))
-    return models[best], float(cost[best]), float((ratio[best] < 1).mean())
+    return models[best], float(cost[best]), float(share[best])
 
 
 def ransac(points: Correspondences, threshold: float, rng: np.random.Generator, *,
@@ -215,11 +235,13 @@ def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iter
 
 
 def warm_up() -> None:
-    """Compile what `refine` needs."""
-    bearings = np.random.default_rng(0).normal(size=(2, 20, 3))
+    """Compile what `ransac` and `refine` need."""
+    rng = np.random.default_rng(0)
+    bearings = rng.normal(size=(2, 20, 3))
     bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
-    refine(np.eye(3), np.array([0.0, 0.0, -1.0]),
-           Correspondences(bearings[0], bearings[1], np.full(20, 1e-3)), iterations=1)
+    points = Correspondences(bearings[0], bearings[1], np.full(20, 1e-3))
+    ransac(points, 1e-3, rng, max_batches=1)
+    refine(np.eye(3), np.array([0.0, 0.0, -1.0]), points, iterations=1)
 
 
 def _spread(direction: Floats) -> Floats:
