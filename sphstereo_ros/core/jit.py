@@ -7,6 +7,7 @@ interpreter lock, and take a range of rows; `rows_in_parallel` runs them on this
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -29,13 +30,35 @@ def fast_kernel(function: F) -> F:
     return cast(F, jit(function))
 
 
+_LEAST_ROWS = 64
+_PIECES_PER_THREAD = 3
+
+
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, thread_name_prefix='sphstereo')
 
 
+@cache
+def _threads() -> int:
+    return max(1, min(os.cpu_count() or 1, 8))
+
+
+def _work_off(pieces: deque[tuple[int, int]], function: Callable[..., Any],
+              args: tuple[Any, ...]) -> None:
+    while True:
+        try:
+            first, last = pieces.popleft()
+        except IndexError:
+            return
+        function(first, last, *args)
+
+
 def rows_in_parallel(function: Callable[..., Any], rows: int, *args: Any) -> None:
     """Call `function(first, last, *args)` for consecutive ranges that cover `rows` rows.
+
+    The calling thread works too, and waits only for what others have begun: where the other cores
+    are busy, it does everything by itself.
 
     Parameters
     ----------
@@ -44,12 +67,14 @@ def rows_in_parallel(function: Callable[..., Any], rows: int, *args: Any) -> Non
     args : passed on
 
     """
-    threads = max(1, min(os.cpu_count() or 1, 8))
-    if threads == 1 or rows < 64:
+    count = min(_threads() * _PIECES_PER_THREAD, rows // _LEAST_ROWS) if _threads() > 1 else 1
+    if count < 2:
         function(0, rows, *args)
         return
-    edges = [rows * i // threads for i in range(threads + 1)]
-    jobs = [_pool(threads).submit(function, a, b, *args)
-            for a, b in pairwise(edges)]
+    pieces = deque(pairwise(rows * i // count for i in range(count + 1)))
+    jobs = [_pool(_threads() - 1).submit(_work_off, pieces, function, args)
+            for _ in range(_threads() - 1)]
+    _work_off(pieces, function, args)
     for job in jobs:
-        job.result()
+        if not job.cancel():
+            job.result()
