@@ -10,7 +10,8 @@ from .builder import Builder
 from .scene import Scene
 from .street import daylight, hills
 
-_SCREED = replace(surfaces.CONCRETE, grain=0.025, crack=0.004)
+_NEW_ASPHALT = replace(surfaces.SMOOTH_ASPHALT, grain=0.03)
+_SCREED = replace(surfaces.CONCRETE, grain=0.012, crack=0.004)
 
 
 def takeoff(seed: int) -> Scene:
@@ -32,8 +33,8 @@ def _ground(build: Builder) -> None:
     paving = (surfaces.SLABS, surfaces.COBBLES)[rng.integers(2)]
     build.add('yard', shapes.box((-5, -4.5, -0.3), (6, 5, 0)), surfaces.seeded(paving, rng))
     build.add('drive', shapes.box((6, -2.2, -0.3), (30, 1.6, -0.01)),
-              surfaces.seeded(surfaces.SMOOTH_ASPHALT, rng))
-    build.add('slab', shapes.box((-2.2, -2.2, -0.2), (2.2, 2.2, 0.02)),
+              surfaces.seeded(_NEW_ASPHALT, rng))
+    build.add('slab', shapes.box((-2.6, -2.6, -0.2), (2.6, 2.6, 0.02)),
               surfaces.seeded(_SCREED, rng))
     build.add('path', shapes.sheet(-24, -5, 0.5, 2.0, -0.03),
               surfaces.seeded(surfaces.EARTH, rng))
