@@ -30,7 +30,8 @@ def actions(context):
     stages = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(share / 'launch' / 'pipeline_launch.py')),
         launch_arguments={'params_file': argument('params_file'), 'use_sim_time': 'true',
-                          'namespace': argument('namespace')}.items())
+                          'namespace': argument('namespace'),
+                          'camera_frame': argument('camera_frame')}.items())
     replay = Node(
         package=PACKAGE, executable='bag_replay', name='bag_replay', output='screen',
         namespace=argument('namespace'),
@@ -50,4 +51,6 @@ def generate_launch_description():
         DeclareLaunchArgument('params_file', default_value=str(default),
                               description='parameter files of all nodes, separated by commas'),
         DeclareLaunchArgument('namespace', default_value='', description='of all topics'),
+        DeclareLaunchArgument('camera_frame', default_value='camera_optical',
+                              description='frame_id of the images'),
         OpaqueFunction(function=actions)])

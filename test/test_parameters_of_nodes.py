@@ -19,13 +19,13 @@ from ros_graph import Graph, graph, mono8, odometry
 from sensor_msgs.msg import Image
 
 from sphstereo_ros.core.config import PARAMETERS, ParameterError
+from sphstereo_ros.ros.images import read_mask
 from sphstereo_ros.ros.parameters import (
     NODE_PARAMETERS,
     NodeParameters,
     documentation_table,
     names_of,
 )
-from sphstereo_ros.ros.shell import read_mask
 
 PLAIN = ('import sys; from sphstereo_ros.nodes.frame_pairing import main; '
          'sys.exit(main(["node", "{}"]))')

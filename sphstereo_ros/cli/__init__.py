@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from sphstereo_ros import __version__
+from sphstereo_ros.allocation import keep_buffers
+from sphstereo_ros.cli.nodes import missing
 from sphstereo_ros.core.config import ParameterError
 
 # Name → module with add_arguments(parser) and main(arguments) → exit status, and what it does.
@@ -42,7 +44,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns its exit status."""
     words = sys.argv[1:] if argv is None else list(argv)
     chosen = _parser().parse_args(words)
-    module = importlib.import_module(COMMANDS[chosen.command][0])
+    keep_buffers()
+    try:
+        module = importlib.import_module(COMMANDS[chosen.command][0])
+    except ModuleNotFoundError as error:
+        if str(error.name).startswith('sphstereo_ros'):
+            raise
+        print(f'sphstereo {chosen.command}: {missing(error)}', file=sys.stderr)
+        return 2
     parser = argparse.ArgumentParser(prog=f'sphstereo {chosen.command}',
                                      description=COMMANDS[chosen.command][1])
     module.add_arguments(parser)

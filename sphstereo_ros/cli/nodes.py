@@ -6,6 +6,14 @@ import sys
 from collections.abc import Callable
 
 
+def missing(error: ModuleNotFoundError) -> str:
+    """One line on a package that is not installed, and where it comes from."""
+    if error.name in ('rosbags', 'mcap', 'tqdm'):
+        return f'there is no {error.name}: pip install rosbags mcap tqdm'
+    return (f"needs ROS 2, and there is no {error.name}: install the package with its extra "
+            "'ros', or source a ROS 2 installation")
+
+
 def _command(name: str) -> Callable[[], int]:
     def start() -> int:
         try:
@@ -13,8 +21,7 @@ def _command(name: str) -> Callable[[], int]:
         except ModuleNotFoundError as error:
             if str(error.name).startswith('sphstereo_ros'):
                 raise
-            print(f"{name}: needs ROS 2, and there is no {error.name}: install the package with "
-                  "its extra 'ros', or source a ROS 2 installation", file=sys.stderr)
+            print(f'{name}: {missing(error)}', file=sys.stderr)
             return 2
         return int(module.main())
     start.__doc__ = f'Run the node `{name}`; returns its exit status.'

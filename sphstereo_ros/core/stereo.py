@@ -65,7 +65,7 @@ class SphericalStereo:
                              self.config.baseline.relative_sigma)
 
     def _mask_of(self, height: int) -> Image8 | None:
-        if self._mask is not None and self._mask.shape[0] != height:
+        if self._mask is not None and self._mask.shape != (height, 2 * height):
             return np.asarray(cv2.resize(self._mask, (2 * height, height),
                                          interpolation=cv2.INTER_NEAREST))
         return self._mask

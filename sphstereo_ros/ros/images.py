@@ -265,7 +265,12 @@ def read_mask(path: str) -> Image8 | None:
     """
     if not path:
         return None
-    mask = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+    try:
+        data = np.fromfile(path, np.uint8)
+    except OSError:
+        data = np.empty(0, np.uint8)
+    # Not imread: it writes a line of its own where there is no file.
+    mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
     if mask is None:
         raise ParameterError(f'camera.mask: cannot read an image from {path}')
     return np.asarray(mask, np.uint8)

@@ -9,8 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
-import numpy as np
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import (
@@ -25,9 +23,10 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 
 from sphstereo_ros.core.config import Config, ParameterError
-from sphstereo_ros.core.frames import Drop, Image8
+from sphstereo_ros.core.frames import Drop
 from sphstereo_ros.ros import qos
 from sphstereo_ros.ros.conversions import diagnostic_message
+from sphstereo_ros.ros.images import read_mask
 from sphstereo_ros.ros.live_messages import make, message_class
 from sphstereo_ros.ros.monitor import Monitor
 from sphstereo_ros.ros.parameters import NodeParameters, names_of
@@ -173,20 +172,6 @@ def _executor() -> Any:
     except ImportError:
         from rclpy.executors import SingleThreadedExecutor as EventsExecutor
     return EventsExecutor()
-
-
-def read_mask(path: str) -> Image8 | None:
-    """Read `camera.mask`: (H, W), non-zero = vehicle; None for an empty path."""
-    if not path:
-        return None
-    try:
-        data = np.fromfile(path, np.uint8)
-    except OSError:
-        data = np.empty(0, np.uint8)
-    mask = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
-    if mask is None:
-        raise ParameterError(f'camera.mask: cannot read an image from {path}')
-    return np.asarray(mask, np.uint8)
 
 
 def run(name: str, build: Callable[[Shell], Sequence[Component]],

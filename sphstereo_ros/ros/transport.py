@@ -1,11 +1,12 @@
 """What a process sets before it starts ROS, so that large messages arrive, and cheaply."""
 from __future__ import annotations
 
-import ctypes
 import os
 import re
 from collections.abc import MutableMapping
 from pathlib import Path
+
+from sphstereo_ros.allocation import keep_buffers
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
 SMALL_PROFILE = Path(__file__).with_name('fastdds_small.xml')
@@ -14,8 +15,6 @@ SHARED_MEMORY = Path('/dev/shm')
 CHOSEN_BY = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE',
              'FASTDDS_BUILTIN_TRANSPORTS')
 
-# mallopt(3): fresh pages for every large message cost more than the message.
-_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD, _M_TOP_PAD = -3, -1, -2
 _MIB = 1 << 20
 
 
@@ -25,7 +24,7 @@ def prepare_process(profile: Path = PROFILE,
 
     Has its effect only before `rclpy.init`. Returns what the user should know, or ''.
     """
-    _keep_buffers()
+    keep_buffers()
     if any(environment.get(name) for name in CHOSEN_BY):
         return ''
     environment['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(profile)
@@ -45,13 +44,3 @@ def segment_size(profile: Path) -> int:
     """Bytes of shared memory that a process with this profile takes."""
     found = re.search(r'<segment_size>(\d+)<', profile.read_text(encoding='utf-8'))
     return int(found.group(1)) if found else 0
-
-
-def _keep_buffers() -> None:
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError):  # not glibc
-        return
-    mallopt(_M_MMAP_THRESHOLD, 32 * _MIB)
-    mallopt(_M_TRIM_THRESHOLD, 256 * _MIB)
-    mallopt(_M_TOP_PAD, 16 * _MIB)
