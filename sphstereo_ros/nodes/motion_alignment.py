@@ -3,6 +3,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
+
 from sphstereo_ros.core.alignment import Aligner
 from sphstereo_ros.core.frames import AlignedWindow, StabilisedWindow
 from sphstereo_ros.ros.conversions import odometry_message, window_message
@@ -29,4 +31,5 @@ def build(shell: Shell, then: Callable[[AlignedWindow, float], None] | None = No
 
 def main(args: list[str] | None = None) -> int:
     """Run the node `motion_alignment`; returns its exit status."""
+    cv2.setNumThreads(1)  # small images: more threads only wait for each other
     return run('motion_alignment', lambda shell: [build(shell)], args, SMALL_PROFILE)

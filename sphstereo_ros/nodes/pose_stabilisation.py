@@ -3,6 +3,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
+
 from sphstereo_ros.core.frames import PairedWindow, StabilisedWindow
 from sphstereo_ros.core.stabilisation import Stabiliser
 from sphstereo_ros.ros.conversions import window_message
@@ -26,4 +28,5 @@ def build(shell: Shell, then: Callable[[StabilisedWindow, float], None] | None =
 
 def main(args: list[str] | None = None) -> int:
     """Run the node `pose_stabilisation`; returns its exit status."""
+    cv2.setNumThreads(1)  # small images: more threads only wait for each other
     return run('pose_stabilisation', lambda shell: [build(shell)], args, SMALL_PROFILE)
