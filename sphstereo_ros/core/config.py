@@ -127,7 +127,7 @@ class PoseConfig:
 
     working_height: int = _p('pose.working_height', 480, 'image height for tracking', low=60,
                              high=4096)
-    max_points: int = _p('pose.max_points', 1800, 'correspondences used', low=50, high=100000)
+    max_points: int = _p('pose.max_points', 2500, 'correspondences used', low=50, high=100000)
     inlier_threshold: float = _p('pose.inlier_threshold', 0.003, 'angular residual of an inlier',
                                  unit='rad', low=1e-5, high=0.1)
     min_inliers: int = _p('pose.min_inliers', 60, 'fewer are a drop', low=8)
@@ -149,7 +149,7 @@ class AlignmentConfig:
                      choices=('refined', 'paper'))
     working_height: int = _p('alignment.working_height', 864, 'polar height of the reduced '
                              'aligned copy', unit='px', low=60, high=4096)
-    max_points: int = _p('alignment.max_points', 3500, 'features followed, about', low=200,
+    max_points: int = _p('alignment.max_points', 5000, 'features followed, about', low=200,
                          high=100000)
     iterations: int = _p('alignment.iterations', 1, 'refinements', low=0, high=10)
     rotation_sigma: float = _p('alignment.rotation_sigma', 0.005 * math.pi / 180,
