@@ -43,6 +43,9 @@ def test_whole_bag_arrives_in_order_and_the_node_ends(ros, tmp_path, storage):
     node = ros.start('bag_replay', f'replay.bag:="{bag}"', 'replay.rate:=4.0', 'replay.wait:=20.0')
     client.message('/image', 9)
     client.message('/odometry', 9)
+    client.until(lambda: client.received['/clock']
+                 and nanoseconds(client.received['/clock'][-1].clock) == T0 + 9 * STEP,
+                 'the last stamp on /clock')
     assert node.ended() == 0
     assert stamps(client.received['/image']) == [T0 + k * STEP for k in range(10)]
     assert [m.pose.pose.position.x for m in client.received['/odometry']] == pytest.approx(

@@ -362,7 +362,8 @@ def test_interrupted_program_leaves_its_results(tmp_path):
     assert 'Traceback' not in errors
     written = results(out)['/frames']
     assert 0 < len(written) < 8000
-    assert f'frames in: {len(written)}' in said
+    counted = int(said.split('frames in: ')[1].split()[0])
+    assert len(written) <= counted <= len(written) + 1  # the one that was interrupted
 
 
 def test_commands_start_quickly_by_loading_only_what_they_need():
