@@ -18,9 +18,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sphstereo_ros.cli import interrupt_on_sigterm
 from sphstereo_ros.core.config import ParameterError
 from sphstereo_ros.core.frames import Drop, Image8
+from sphstereo_ros.interrupts import interrupt_on_signals
 from sphstereo_ros.replay.bag_messages import TYPESTORE
 from sphstereo_ros.replay.output import McapOutput
 from sphstereo_ros.replay.player import stamp_of
@@ -286,7 +286,7 @@ def main() -> int:
     parser.add_argument('--params', type=Path, metavar='FILE', help='(default: config/live.yaml)')
     parser.add_argument('--seconds', type=float, default=15.0, help='of the real-time pass')
     arguments = parser.parse_args()
-    interrupt_on_sigterm()
+    interrupt_on_signals()
     try:
         return run(arguments)
     except (BadInput, ParameterError) as error:

@@ -6,11 +6,9 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import signal
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import NoReturn
 
 from sphstereo_ros import __version__
 from sphstereo_ros.allocation import keep_buffers
@@ -71,10 +69,3 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _bad_input() -> type[Exception]:
     from sphstereo_ros.replay.records import BadInput
     return BadInput
-
-
-def interrupt_on_sigterm() -> None:
-    """End by KeyboardInterrupt on SIGTERM too, so that files are completed."""
-    def interrupt(number: int, frame: object) -> NoReturn:
-        raise KeyboardInterrupt
-    signal.signal(signal.SIGTERM, interrupt)

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from sphstereo_ros.cli import INTERRUPTED, interrupt_on_sigterm
+from sphstereo_ros.cli import INTERRUPTED
 from sphstereo_ros.cli.run import output_path
+from sphstereo_ros.interrupts import interrupt_on_signals
 from sphstereo_ros.replay.output import McapOutput
 from sphstereo_ros.replay.records import BadInput
 from sphstereo_ros.replay.video_import import import_video
@@ -46,7 +47,7 @@ def main(arguments: argparse.Namespace) -> int:
     _checked(arguments)
     video = Video(arguments.video, arguments.fps, arguments.start, arguments.end)
     path = output_path(arguments.output, arguments.video, '.mcap')
-    interrupt_on_sigterm()
+    interrupt_on_signals()
     interrupted = False
     with McapOutput(path) as output, tqdm(total=video.count(), unit='frame',
                                           disable=None) as progress:

@@ -7,7 +7,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from sphstereo_ros.cli import INTERRUPTED, interrupt_on_sigterm
+from sphstereo_ros.cli import INTERRUPTED
+from sphstereo_ros.interrupts import interrupt_on_signals
 from sphstereo_ros.replay.offline import TOPICS, OfflineRun, wanted_topics
 from sphstereo_ros.replay.output import McapOutput
 from sphstereo_ros.replay.parameter_files import load_config
@@ -57,7 +58,7 @@ def main(arguments: argparse.Namespace) -> int:
     source = open_source(arguments.input, arguments.fps)
     topic = image_topic(source, arguments.topic)
     path = output_path(arguments.out, arguments.input, '_depth.mcap')
-    interrupt_on_sigterm()
+    interrupt_on_signals()
     interrupted = False
     with McapOutput(path) as output:
         run = OfflineRun(config, topic, output, topics)

@@ -8,6 +8,7 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 
+from sphstereo_ros.interrupts import uninterrupted
 from sphstereo_ros.replay.bag_messages import TYPESTORE
 from sphstereo_ros.replay.records import BadInput
 
@@ -52,10 +53,11 @@ class McapOutput:
     def write_serialised(self, topic: str, kind: str, stamp: int, data: bytes) -> None:
         """Write a message that is serialised as CDR."""
         time = max(stamp, 0)
-        self._sequences[topic] = self._sequences.get(topic, 0) + 1
-        self._writer.add_message(self._channel(topic, kind), time, data, time,
-                                 self._sequences[topic])
-        self.written += 1
+        with uninterrupted():  # a chunk that is interrupted on its way to the file is lost
+            self._sequences[topic] = self._sequences.get(topic, 0) + 1
+            self._writer.add_message(self._channel(topic, kind), time, data, time,
+                                     self._sequences[topic])
+            self.written += 1
 
     def _channel(self, topic: str, kind: str) -> int:
         if topic not in self._channels:
@@ -69,7 +71,8 @@ class McapOutput:
     def close(self) -> None:
         """Complete the file."""
         if not self._file.closed:
-            try:
-                self._writer.finish()  # type: ignore[no-untyped-call]
-            finally:
-                self._file.close()
+            with uninterrupted():
+                try:
+                    self._writer.finish()  # type: ignore[no-untyped-call]
+                finally:
+                    self._file.close()
