@@ -65,9 +65,9 @@ def stabilised(current: View, reference: View, believed: RelativePose | None = N
 
 
 def aligned(current: View, reference: View, pose: RelativePose,
-            **parameters: object) -> RelativePose | Drop:
+            mask: np.ndarray | None = None, **parameters: object) -> RelativePose | Drop:
     paired = window(current, (reference, pose))
-    out = Aligner(resolve(parameters)).process(
+    out = Aligner(resolve(parameters), mask).process(
         StabilisedWindow(paired.current, paired.references))
     return out if isinstance(out, Drop) else out.references[0].pose
 
@@ -262,6 +262,20 @@ def test_two_places_that_have_nothing_in_common_are_a_drop():
     drop = stabilised(seen(), seen(other, (0.3, 0.1, 0.2)))
     assert isinstance(drop, Drop)
     assert drop.cause == 'too_few_inliers'
+
+
+def test_alignment_leaves_out_what_is_under_the_mask():
+    reference, current = before('forward', (0.01, 0.02, 0.0)), seen()
+    mask = np.full((90, 180), 255, np.uint8)  # of any size
+    out = aligned(current, reference, exact(reference, current), mask)
+    assert isinstance(out, Drop)
+    assert out.cause == 'alignment_failed'
+    mask[:, :90] = 0
+    out = aligned(current, reference, exact(reference, current), mask)
+    assert isinstance(out, RelativePose)
+    turn, direction = errors(out, reference, current)
+    assert turn < 0.05
+    assert direction < 0.3
 
 
 def test_descriptors_match_over_the_seam_and_beside_the_mask():

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import relative_pose
+from .camera import Equirectangular
 from .config import AlignmentConfig, Config
 from .frames import AlignedWindow, Drop, Frame, Image8, Reference, RelativePose, StabilisedWindow
 from .paper import window_ratio_direction
@@ -83,13 +84,24 @@ class Aligner:
         grid = PolarGrid(height, _MARGIN, _WRAP)
         pose = reference.pose
         for _ in range(self.config.iterations):
-            points = aligned_correspondences(images[0], images[1], pose, grid,
-                                             self.config.max_points)
+            points = self._beside_mask(aligned_correspondences(
+                images[0], images[1], pose, grid, self.config.max_points))
             refined = self._refined(points, pose, grid.pixel)
             if isinstance(refined, Drop):
                 return refined
             pose = with_length(refined, reference.pose)
         return replace(reference, pose=self._with_floor(pose))
+
+    def _beside_mask(self, points: Correspondences) -> Correspondences:
+        """Those that neither view sees on the vehicle."""
+        if self._mask is None:
+            return points
+        height, width = self._mask.shape
+        keep = np.ones(len(points), bool)
+        for bearings in (points.reference, points.current):
+            u, v = np.rint(Equirectangular(height, width).project(bearings)).astype(np.intp).T
+            keep &= self._mask[v.clip(0, height - 1), u % width] == 0
+        return points[keep]
 
     @staticmethod
     def _refined(points: Correspondences, pose: RelativePose,

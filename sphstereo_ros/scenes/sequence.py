@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphstereo_ros.core.frames import RelativePose
+from sphstereo_ros.core.rotations import matrix_from_quaternion, quaternion_from_matrix
 
 from .imaging import (
     NO_NOISE,
@@ -219,32 +220,12 @@ _CONVENTIONS = {
 }
 
 
-def quaternion(rotation: Array) -> list[float]:
-    """x, y, z, w of a rotation matrix, w ≥ 0."""
-    vector = cv2.Rodrigues(np.asarray(rotation, np.float64))[0].ravel()
-    angle = float(np.linalg.norm(vector))
-    axis = vector / angle if angle else vector
-    return [*(np.sin(angle / 2) * axis).tolist(), float(np.cos(angle / 2))]
-
-
-def rotation_matrix(xyzw: Sequence[float]) -> NDArray[np.float64]:
-    """The rotation (3, 3) of a quaternion of any length; ValueError for zero or NaN."""
-    q = np.asarray(xyzw, np.float64)
-    length = float(np.linalg.norm(q))
-    if not 1e-9 < length < np.inf:
-        raise ValueError(f'{list(xyzw)} is no rotation')
-    x, y, z, w = q / length
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])
-
-
 def _entry(index: int, frame: TruthFrame, image: str, depth: str) -> dict[str, Any]:
     finite = frame.range[np.isfinite(frame.range)]
     return {'index': index, 'image': image, 'depth': depth,
             'position_m': frame.position.tolist(),
-            'quaternion_xyzw': quaternion(frame.rotation @ BODY_FROM_OPTICAL.T),
+            'quaternion_xyzw': quaternion_from_matrix(
+                frame.rotation @ BODY_FROM_OPTICAL.T).tolist(),
             'relative_exposure': frame.exposure,
             'sky_fraction': float(np.mean(np.isposinf(frame.range))),
             'min_range_m': float(finite.min()) if finite.size else None,
@@ -253,11 +234,11 @@ def _entry(index: int, frame: TruthFrame, image: str, depth: str) -> dict[str, A
 
 def _add_motions(entries: list[dict[str, Any]]) -> None:
     for this, following in pairwise(entries):
-        turned = [rotation_matrix(e['quaternion_xyzw']) for e in (this, following)]
+        turned = [matrix_from_quaternion(e['quaternion_xyzw']) for e in (this, following)]
         step = np.subtract(following['position_m'], this['position_m'])
         length = float(np.linalg.norm(step))
         relative = turned[0].T @ turned[1]
-        q = quaternion(relative)
+        q = quaternion_from_matrix(relative).tolist()
         this['motion_to_next'] = {
             'distance_m': length,
             'direction_cam': (turned[0].T @ step / max(length, 1e-12)).tolist(),
@@ -324,7 +305,7 @@ class SavedSequence(Sequence[TruthFrame]):
         seconds = entry.get('stamp', index % len(self) / FRAME_RATE)
         return TruthFrame(
             FIRST_STAMP + round(seconds * 1e9), np.asarray(image, np.uint8), distance,
-            rotation_matrix(entry['quaternion_xyzw']) @ BODY_FROM_OPTICAL,
+            matrix_from_quaternion(entry['quaternion_xyzw']) @ BODY_FROM_OPTICAL,
             np.array(entry['position_m'], np.float64), entry.get('relative_exposure', 1.0),
             path.read_bytes() if path.suffix == '.jpg' else None)
 
