@@ -8,9 +8,11 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from .nuisances import STREETS, check
 from .sequence import (
     NO_NOISE,
     NOISE,
+    NUISANCES,
     SCENES,
     TUNING_SEEDS,
     load_sequence,
@@ -39,6 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--shake', type=float, nargs=2, default=(1.0, 3.0),
                         metavar=('LOW', 'HIGH'), help='rotation between frames, degrees '
                         '(default: 1 3)')
+    parser.add_argument('--nuisance', choices=NUISANCES, help='something that makes it hard: '
+                        f'{", ".join(STREETS)} are for the street alone')
     parser.add_argument('--exposure', type=float, default=0.05,
                         help='largest relative change of exposure (default: %(default)s)')
     parser.add_argument('--no-noise', action='store_true', help='no image noise')
@@ -58,8 +62,9 @@ def main(args: argparse.Namespace) -> int:
     sequence = render_sequence(
         args.name, args.seed, args.frames, args.height, args.spacing, tuple(args.shake),
         args.exposure, NO_NOISE if args.no_noise else NOISE, args.jpeg or None,
-        tuple(args.mount))
-    save_sequence(sequence, args.folder, args.name, progress=_bar(len(sequence)))
+        tuple(args.mount), nuisance=args.nuisance)
+    name = f'{args.name} {args.nuisance}' if args.nuisance else args.name
+    save_sequence(sequence, args.folder, name, progress=_bar(len(sequence)))
     if args.bag is not None:
         from .bag import write_bag
         write_bag(load_sequence(args.folder), args.bag)
@@ -75,6 +80,10 @@ def _problem(args: argparse.Namespace) -> str:
         return '--shake is a least and a largest angle'
     if args.seed < 0:
         return '--seed must not be negative'
+    try:
+        check(args.name, args.nuisance)
+    except ValueError as error:
+        return str(error)
     if args.folder.exists() and (not args.folder.is_dir() or any(args.folder.iterdir())):
         return f'{args.folder} exists and is not an empty folder'
     try:

@@ -68,14 +68,21 @@ class Camera:
 
     def range(self) -> NDArray[np.float64]:
         """Distance (H, 2H) to the first surface through each pixel's centre; +inf is sky."""
+        return self.range_and_parts()[0]
+
+    def range_and_parts(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """The range, and which of the scene's parts (H, 2H) it is of; −1 is sky."""
         out = np.empty(2 * self.height**2)
+        parts = np.empty(out.size, np.int64)
 
         def rows(pixels: Array) -> None:
             rays = self._rays(pixels, _CENTRE)
-            out[pixels] = self.scene.cast(self._origins(len(rays)), rays).distance
+            hits = self.scene.cast(self._origins(len(rays)), rays)
+            out[pixels] = hits.distance
+            parts[pixels] = np.where(hits.face < 0, -1, self.scene.face_part[hits.face])
 
         self._each_chunk(np.arange(out.size), 1, rows)
-        return out.reshape(self.height, -1)
+        return out.reshape(self.height, -1), parts.reshape(self.height, -1)
 
     def picture(self, samples: int = 2, edge_samples: int = 4) -> NDArray[np.float32]:
         """Linear RGB (H, 2H, 3): samples² rays a pixel, edge_samples² where they disagree."""

@@ -26,11 +26,21 @@ from .imaging import (
     to_bytes,
     with_noise,
 )
-from .trajectory import BODY_FROM_OPTICAL, Trajectory, climb, drive, mounted, shaken
+from .nuisances import NUISANCES, STREETS, WALL_SPACING, ImageEffects, check, with_nuisance
+from .trajectory import (
+    BODY_FROM_OPTICAL,
+    FRAME_RATE,
+    Trajectory,
+    climb,
+    drive,
+    mounted,
+    shaken,
+)
 
 if TYPE_CHECKING:  # reading a folder needs no ray caster
     from .render import Camera
     from .scene import Scene
+    from .traffic import Mover
 
 Array = NDArray[Any]
 
@@ -40,7 +50,6 @@ TUNING_SEEDS = (1, 2, 3, 4, 5)
 REPORTED_SEEDS = (1001, 1002, 1003, 1004, 1005)
 
 FIRST_STAMP = 1_700_000_000_000_000_000
-FRAME_RATE = 30.0
 SCENES = ('street', 'takeoff', 'corridor')
 
 
@@ -50,7 +59,8 @@ class TruthFrame:
 
     stamp : ns; image : (H, 2H, 3) uint8 BGR; range : (H, 2H) metres through pixel centres, +inf
     is sky; rotation : (3, 3) world ← camera_optical; position : (3,) metres, world;
-    exposure : relative; jpeg : the image's file, where it went through JPEG
+    exposure : relative; jpeg : the image's file, where it went through JPEG; moving : (H, 2H)
+    bool, whether the pixel's range is of something that moves; None if nothing in the scene does
     """
 
     stamp: int
@@ -60,6 +70,7 @@ class TruthFrame:
     position: NDArray[np.float64]
     exposure: float = 1.0
     jpeg: bytes | None = None
+    moving: NDArray[np.bool_] | None = None
 
 
 def stamp_of(index: int) -> int:
@@ -74,34 +85,20 @@ def true_pose(reference: TruthFrame, current: TruthFrame) -> RelativePose:
                         back @ (reference.position - current.position))
 
 
-@dataclass(frozen=True)
-class ImageEffects:
-    """What happens to the light after the lens.
-
-    gain : of the exposure, for the scene; exposure : largest relative change of it from frame to
-    frame; jpeg : quality, None = no JPEG
-    """
-
-    gain: float = 1.0
-    exposure: float = 0.05
-    noise: Noise = NOISE
-    jpeg: int | None = 92
-
-
 class RenderedSequence(Sequence[TruthFrame]):
     """Frames of a scene along a trajectory, each rendered when it is asked for."""
 
     def __init__(self, scene: Scene, trajectory: Trajectory, height: int, seed: int,
-                 effects: ImageEffects) -> None:
+                 effects: ImageEffects, movers: Sequence[Mover] = ()) -> None:
+        """`scene` is without the `movers`, which are put into it frame by frame."""
         self.scene = scene
         self.trajectory = trajectory
         self.height = height
         self.seed = seed
         self.effects = effects
-        # The first frame is at the nominal exposure.
-        change = np.random.default_rng([seed, 2]).uniform(-1, 1, len(trajectory))
-        self.exposures = np.exp(effects.exposure * np.where(np.arange(len(change)) == 0, 0,
-                                                            change))
+        self.movers = tuple(movers)
+        self.exposures = effects.exposures(seed, len(trajectory))
+        self._latest: tuple[int, Scene] | None = None
 
     def __len__(self) -> int:
         return len(self.trajectory)
@@ -112,33 +109,58 @@ class RenderedSequence(Sequence[TruthFrame]):
             raise IndexError(f'frame {index} of {len(self)}')
         index %= len(self)
         camera = self.camera(index)
-        exposure = float(self.exposures[index])
+        picture, data = self._picture(index, camera.picture())
+        distance, part = camera.range_and_parts()
+        moving = np.isin(part, self._moving_parts(camera.scene)) if self.movers else None
+        return TruthFrame(stamp_of(index), picture, distance, camera.rotation, camera.position,
+                          float(self.exposures[index]), data, moving)
+
+    def _picture(self, index: int, light: Array) -> tuple[Image8, bytes | None]:
+        """The picture of frame `index` from its radiance, and its JPEG, if it went through one."""
+        effects = self.effects
+        if effects.flicker:
+            light = light * effects.row_exposures(self.seed, index, len(light))[:, None, None]
         rng = np.random.default_rng([self.seed, 3, index])
-        image = develop(camera.picture(), self.effects.gain * exposure)
-        picture = to_bytes(with_noise(image, self.effects.noise, rng))
-        data = None
-        if self.effects.jpeg is not None:
-            encoded = encode_jpeg(picture, self.effects.jpeg)
-            data = encoded.tobytes()
-            picture = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8)
-        return TruthFrame(stamp_of(index), picture, camera.range(), camera.rotation,
-                          camera.position, exposure, data)
+        image = develop(light, effects.gain * float(self.exposures[index]))
+        picture = to_bytes(with_noise(image, effects.noise, rng))
+        if effects.jpeg is None:
+            return picture, None
+        encoded = encode_jpeg(picture, effects.jpeg)
+        return np.asarray(cv2.imdecode(encoded, cv2.IMREAD_COLOR), np.uint8), encoded.tobytes()
+
+    def _moving_parts(self, scene: Scene) -> list[int]:
+        names = {part.name for mover in self.movers for part in mover.parts}
+        return [k for k, part in enumerate(scene.parts) if part.name in names]
+
+    def scene_at(self, index: int) -> Scene:
+        """The scene at the stamp of frame `index`: what moves is where it is then."""
+        if not self.movers:
+            return self.scene
+        if self._latest is None or self._latest[0] != index:
+            seconds = (stamp_of(index) - FIRST_STAMP) / 1e9
+            parts = [part for mover in self.movers for part in mover.at(seconds)]
+            self._latest = index, self.scene.replaced(*parts)
+        return self._latest[1]
 
     def camera(self, index: int, height: int | None = None) -> Camera:
         """The camera of frame `index`, at this sequence's or another height."""
         from .render import Camera
-        return Camera(self.scene, self.trajectory.rotations[index],
+        return Camera(self.scene_at(index), self.trajectory.rotations[index],
                       self.trajectory.positions[index], height or self.height)
 
 
 @lru_cache(maxsize=1)
-def _build(name: str, seed: int) -> Scene:
+def _build(name: str, seed: int, nuisance: str | None = None) -> Scene:
+    from . import hard_streets
     from .corridor import corridor
     from .street import street
     from .takeoff import takeoff
     builders: dict[str, Callable[[int], Scene]] = {
-        'street': street, 'takeoff': takeoff, 'corridor': corridor}
-    return builders[name](seed)
+        'street': street, 'takeoff': takeoff, 'corridor': corridor,
+        'occlusion': hard_streets.occlusion_street,
+        'repetition': hard_streets.repetition_street,
+        'traffic': hard_streets.traffic_street, 'wall': hard_streets.wall_street}
+    return builders[nuisance or name](seed)
 
 
 def _path(name: str, rng: np.random.Generator, frames: int,
@@ -149,9 +171,21 @@ def _path(name: str, rng: np.random.Generator, frames: int,
     if name == 'corridor':
         start = (0.0, float(rng.uniform(-0.25, 0.25)), float(rng.uniform(1.2, 1.5)))
         return drive(rng, frames, start, 0.14 if spacing is None else spacing, turn=turn)
+    if name == 'wall':
+        start = (0.0, 0.0, float(rng.uniform(1.7, 2.1)))
+        return drive(rng, frames, start, WALL_SPACING if spacing is None else spacing, turn=turn,
+                     drift=0.0)
     start = (0.0, float(rng.uniform(-0.9, 0.7)), float(rng.uniform(1.7, 2.1)))
     return drive(rng, frames, start, 0.28 if spacing is None else spacing, turn=turn,
                  heading=float(rng.normal(0, 0.01)))
+
+
+def _movers(nuisance: str | None, seed: int, positions: Array) -> Sequence[Mover]:
+    if nuisance != 'traffic':
+        return ()
+    from .traffic import traffic
+    steps = np.diff(positions[:, 0])
+    return traffic(seed, FRAME_RATE * float(steps.mean()) if len(steps) else 0.0)
 
 
 _GAIN = {'street': 1.0, 'takeoff': 0.8, 'corridor': 1.6}
@@ -162,7 +196,7 @@ def render_sequence(name: str, seed: int, frames: int, height: int = 960,
                     shake_deg: tuple[float, float] = (1.0, 3.0), exposure: float = 0.05,
                     noise: Noise = NOISE, jpeg: int | None = 92,
                     mount: tuple[float, float, float] = (0.0, 0.0, 0.0),
-                    turn_deg: float = 0.0) -> RenderedSequence:
+                    turn_deg: float = 0.0, nuisance: str | None = None) -> RenderedSequence:
     """A sequence of the scene `name`, to be rendered frame by frame on demand.
 
     Parameters
@@ -171,32 +205,39 @@ def render_sequence(name: str, seed: int, frames: int, height: int = 960,
     seed : of layout, textures, trajectory, shake and noise
     frames, height : number of frames; image rows (columns are twice that)
     spacing : metres between consecutive frames, one or frames − 1 values; None: the scene's own
-        (street 0.28, corridor 0.14, take-off rising from 0.20 to 0.35)
+        (street 0.28, with the wall 0.267; corridor 0.14; take-off rising from 0.20 to 0.35)
     shake_deg : least and largest rotation between consecutive frames, without `turn_deg`
     exposure : largest relative change of the exposure
     noise : at 8 bits; NO_NOISE for none
     jpeg : quality the image went through; None for none
     mount : roll, pitch, yaw of the camera on the vehicle, rad
     turn_deg : the vehicle turns left by that much a frame (street and corridor)
+    nuisance : one of NUISANCES, or None; where it is about exposure or noise, it overrules
+        `exposure` and `noise`
 
     Raises
     ------
     ValueError
-        for an unknown scene or less than one frame
+        for an unknown scene or nuisance, a nuisance that the scene does not have, or less than
+        one frame
     ImportError
         without trimesh and embreex
 
     """
     if name not in SCENES:
         raise ValueError(f'{name!r} is none of {", ".join(SCENES)}')
+    check(name, nuisance)
     if frames < 1 or height < 2:
         raise ValueError(f'{frames} frames of {height} rows')
     rng = np.random.default_rng([seed, 4])
-    attitudes, positions = _path(name, rng, frames, spacing, np.radians(turn_deg))
+    course = 'wall' if nuisance == 'wall' else name
+    attitudes, positions = _path(course, rng, frames, spacing, np.radians(turn_deg))
     low, high = np.radians(shake_deg)
     trajectory = mounted(attitudes, positions, shaken(rng, frames, low, high), mount)
-    return RenderedSequence(_build(name, seed), trajectory, height, seed,
-                            ImageEffects(_GAIN[name], exposure, noise, jpeg))
+    effects = with_nuisance(ImageEffects(_GAIN[name], exposure, noise, jpeg), nuisance)
+    scene = _build(name, seed, nuisance if nuisance in STREETS else None)
+    return RenderedSequence(scene, trajectory, height, seed, effects,
+                            _movers(nuisance, seed, trajectory.positions))
 
 
 def rounded_range(values: Array, bits: int = 15) -> NDArray[np.float32]:
@@ -215,6 +256,7 @@ _CONVENTIONS = {
                   '2 pi, positive to the left; lat = (0.5 - (v + 0.5)/H) pi, positive up',
     'range': "npz key 'range': Euclidean distance from the camera centre to the first surface "
              'along the ray through the pixel centre, metres, +inf = sky',
+    'moving': 'png, only where something in the scene moves: 255 where the pixel shows it, else 0',
     'motion_to_next': 'direction_cam: unit vector of (p[i+1] - p[i]) in the frame of camera i; '
                       'rotation_next_in_this_xyzw: orientation of camera i+1 in camera i',
 }
@@ -249,7 +291,8 @@ def _add_motions(entries: list[dict[str, Any]]) -> None:
 def save_sequence(sequence: Sequence[TruthFrame], folder: str | Path, name: str = 'sequence',
                   small_height: int | None = None,
                   progress: Callable[[Iterator[int]], Iterator[int]] = lambda x: x) -> None:
-    """Write frames as `meta.json`, `frame_%04d.jpg` or `.png`, and `depth_%04d.npz`.
+    """Write frames as `meta.json`, `frame_%04d.jpg` or `.png`, `depth_%04d.npz`, and
+    `moving_%04d.png` where the scene has something that moves.
 
     small_height : also write `range_small_%04d.npz`, the range at that height (rendered sequences
     only); progress : wraps the iterator over frames, as tqdm does
@@ -265,6 +308,9 @@ def save_sequence(sequence: Sequence[TruthFrame], folder: str | Path, name: str 
         depth = f'depth_{index:04d}.npz'
         np.savez_compressed(folder / depth, range=rounded_range(frame.range))
         entry = _entry(index, frame, image, depth)
+        if frame.moving is not None:
+            entry['moving'] = f'moving_{index:04d}.png'
+            cv2.imwrite(str(folder / entry['moving']), np.uint8(255) * frame.moving)
         if small_height is not None and isinstance(sequence, RenderedSequence):
             entry['range_small'] = f'range_small_{index:04d}.npz'
             small = sequence.camera(index, small_height).range()
@@ -307,7 +353,16 @@ class SavedSequence(Sequence[TruthFrame]):
             FIRST_STAMP + round(seconds * 1e9), np.asarray(image, np.uint8), distance,
             matrix_from_quaternion(entry['quaternion_xyzw']) @ BODY_FROM_OPTICAL,
             np.array(entry['position_m'], np.float64), entry.get('relative_exposure', 1.0),
-            path.read_bytes() if path.suffix == '.jpg' else None)
+            path.read_bytes() if path.suffix == '.jpg' else None, self._moving(entry))
+
+    def _moving(self, entry: dict[str, Any]) -> NDArray[np.bool_] | None:
+        if 'moving' not in entry:
+            return None
+        path = self.folder / entry['moving']
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise ValueError(f'{path}: not readable as an image')
+        return np.asarray(image) > 127
 
 
 def load_sequence(folder: str | Path) -> SavedSequence:
@@ -315,6 +370,6 @@ def load_sequence(folder: str | Path) -> SavedSequence:
     return SavedSequence(folder)
 
 
-__all__ = ['NOISE', 'NO_NOISE', 'REPORTED_SEEDS', 'SCENES', 'TUNING_SEEDS', 'ImageEffects',
-           'Noise', 'RenderedSequence', 'SavedSequence', 'TruthFrame', 'load_sequence',
-           'render_sequence', 'save_sequence', 'true_pose']
+__all__ = ['NOISE', 'NO_NOISE', 'NUISANCES', 'REPORTED_SEEDS', 'SCENES', 'TUNING_SEEDS',
+           'ImageEffects', 'Noise', 'RenderedSequence', 'SavedSequence', 'TruthFrame',
+           'load_sequence', 'render_sequence', 'save_sequence', 'true_pose']

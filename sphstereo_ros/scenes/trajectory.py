@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+FRAME_RATE = 30.0  # Hz, of all sequences
+
 # Axes of camera_optical (x right, y down, z forward) in a body frame (x forward, y left, z up).
 BODY_FROM_OPTICAL: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
