@@ -1,38 +1,72 @@
-"""Accuracy: pose and range against exact truth, method by method."""
+"""Accuracy: pose and range against exact truth, method by method.
+
+Every method is the chain itself, fed frame by frame as live, with the true odometry as the scale.
+"""
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections import Counter, defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from sphstereo_ros.core import rotations
+from sphstereo_ros.core.alignment import Aligner
 from sphstereo_ros.core.chain import Chain, StageResults
-from sphstereo_ros.core.config import resolve
-from sphstereo_ros.core.frames import Drop, Frame, FrameKey, PairedWindow, Reference, RelativePose
+from sphstereo_ros.core.config import Config, resolve
+from sphstereo_ros.core.frames import (
+    AlignedWindow,
+    Drop,
+    Frame,
+    FrameKey,
+    PairedWindow,
+    RelativePose,
+    StabilisedWindow,
+)
+from sphstereo_ros.core.motion import OdometrySample
+from sphstereo_ros.core.rotations import OPTICAL_FROM_LINK
+from sphstereo_ros.core.stabilisation import Stabiliser
 from sphstereo_ros.scenes.sequence import TruthFrame, true_pose
 
-from .scoring import BANDS, average, compare
+from .methods import Method
+from .scoring import average, compare
+
+Frames = Mapping[int, TruthFrame]  # by stamp
+# Frames before the first that is scored: the default window is whole then.
+SKIPPED = 10
+
+
+@dataclass
+class _PoseErrors:
+    """Of the references so many frames back, degrees; `lost`: paired, but without a pose."""
+
+    rotation: list[float] = field(default_factory=list)
+    direction: list[float] = field(default_factory=list)
+    lost: int = 0
+
+    def summary(self) -> dict[str, float | None]:
+        known = bool(self.rotation)
+        return {'rotation_deg': float(np.median(self.rotation)) if known else None,
+                'direction_deg': float(np.median(self.direction)) if known else None,
+                'lost': 100 * self.lost / (self.lost + len(self.rotation))}
 
 
 @dataclass
 class MethodScore:
-    """What one method made of a sequence: errors in degrees, scores as in `scoring.compare`."""
+    """What one method made of the frames that count: scores as in `scoring.compare`."""
 
-    rotation: list[float] = field(default_factory=list)
-    direction: list[float] = field(default_factory=list)
+    poses: dict[int, _PoseErrors] = field(default_factory=lambda: defaultdict(_PoseErrors))
     scores: list[dict[str, Any]] = field(default_factory=list)
     drops: Counter[str] = field(default_factory=Counter)
 
     def summary(self) -> dict[str, Any]:
-        """Medians of the pose errors, means of the range scores, drops by cause."""
-        return {'pairs': len(self.scores), 'drops': dict(self.drops),
-                'rotation_deg': float(np.median(self.rotation)) if self.rotation else None,
-                'direction_deg': float(np.median(self.direction)) if self.direction else None,
+        """Medians of the pose errors by frames back, means of the range scores, drops by cause."""
+        return {'frames': len(self.scores), 'drops': dict(self.drops),
+                'references': {str(back): self.poses[back].summary()
+                               for back in sorted(self.poses)},
                 **(average(self.scores) if self.scores else {})}
 
 
@@ -44,16 +78,6 @@ def pose_errors(estimate: RelativePose, truth: RelativePose) -> tuple[float, flo
             float(np.degrees(np.arctan2(cross, estimate.direction @ truth.direction))))
 
 
-def pairs(sequence: Sequence[TruthFrame], interval: int = 1,
-          ) -> Iterator[tuple[TruthFrame, TruthFrame]]:
-    """Reference and current frames `interval` apart; each frame is read once."""
-    recent: list[TruthFrame] = []
-    for index in range(len(sequence)):
-        recent.append(sequence[index])
-        if len(recent) > interval:
-            yield recent.pop(0), recent[-1]
-
-
 def as_frame(frame: TruthFrame, height: int) -> Frame:
     """The grey frame as the chain gets it, at working resolution (0 = as it is)."""
     grey = cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
@@ -62,54 +86,113 @@ def as_frame(frame: TruthFrame, height: int) -> Frame:
     return Frame(FrameKey(frame.stamp, 'camera_optical'), np.asarray(grey, np.uint8))
 
 
-class Contest:
-    """Runs every method on the same pairs, the true baseline's length given (as by odometry)."""
+def true_odometry(frame: TruthFrame) -> OdometrySample:
+    """The true pose of the camera, which is `base_link` where no mount is given."""
+    return OdometrySample(frame.stamp, frame.position, frame.rotation @ OPTICAL_FROM_LINK)
 
-    def __init__(self, methods: Mapping[str, Mapping[str, object]]) -> None:
-        self.chains = {name: Chain(resolve(parameters)) for name, parameters in methods.items()}
-        self.results = {name: MethodScore() for name in methods}
 
-    def add(self, reference: TruthFrame, current: TruthFrame) -> None:
-        """One pair through all methods."""
-        truth = true_pose(reference, current)
-        prior = RelativePose(np.eye(3), np.array([0.0, 0.0, -truth.baseline]))
-        for name, chain in self.chains.items():
-            height = chain.config.stereo.working_height
-            window = PairedWindow(as_frame(current, height),
-                                  (Reference(as_frame(reference, height), prior),))
-            self._score(name, chain.process(window), truth, current.range)
+class _TruePoses(Stabiliser):
+    """Stages 2 and 3, as if they made no error."""
 
-    def _score(self, name: str, outcome: StageResults | Drop, truth: RelativePose,
-               true_range: NDArray[np.floating]) -> None:
-        result = self.results[name]
-        if isinstance(outcome, Drop):
-            result.drops[outcome.cause] += 1
+    def __init__(self, config: Config, frames: Frames) -> None:
+        super().__init__(config)
+        self._frames = frames
+
+    def process(self, window: PairedWindow) -> StabilisedWindow | Drop:
+        current = self._frames[window.current.key.stamp]
+        return StabilisedWindow(window.current, tuple(
+            replace(r, pose=true_pose(self._frames[r.frame.key.stamp], current))
+            for r in window.references))
+
+
+class _AsTheyAre(Aligner):
+    def process(self, window: StabilisedWindow) -> AlignedWindow | Drop:
+        return AlignedWindow(window.current, window.references)
+
+
+class _Run:
+    """One method over one sequence."""
+
+    def __init__(self, method: Method, frames: Frames, score: MethodScore) -> None:
+        self._remembers = method.remembers
+        self._frames = frames
+        self._score = score
+        self._chain = Chain(resolve({'baseline.source': 'odometry', **method.parameters}))
+        if method.true_pose:
+            self._chain.stabiliser = _TruePoses(self._chain.config, frames)
+            self._chain.aligner = _AsTheyAre(self._chain.config)
+
+    def add(self, truth: TruthFrame, counts: bool) -> None:
+        chain = self._chain
+        frame = as_frame(truth, chain.config.stereo.working_height)
+        chain.add_odometry(true_odometry(truth))
+        if counts:
+            self._take(chain.add_frame(frame)[-1], truth)
+        elif self._remembers:
+            chain.add_frame(frame)
+        else:
+            chain.pairer.add_frame(frame)
+
+    def _take(self, outcome: StageResults | Drop, truth: TruthFrame) -> None:
+        stamps = list(self._frames)
+        before = self._frames[stamps[stamps.index(truth.stamp) - 1]]
+        score = partial(compare, truth=truth.range, direction=true_pose(before, truth).direction,
+                        moving=getattr(truth, 'moving', None))
+        if isinstance(outcome, Drop):  # nothing is known of the whole sphere
+            self._score.drops[outcome.cause] += 1
+            height = self._chain.config.stereo.working_height or len(truth.image)
+            unknown = np.full((height, 2 * height), np.nan, np.float32)
+            self._score.scores.append(score(unknown))
             return
-        turn, direction = pose_errors(outcome.aligned.references[0].pose, truth)
-        result.rotation.append(turn)
-        result.direction.append(direction)
         image = outcome.range_image
-        result.scores.append(compare(image.range, true_range, image.sigma))
+        self._score.scores.append(score(image.range, sigma=image.sigma,
+                                        marked=getattr(image, 'moving', None)))
+        self._take_poses(outcome, truth, stamps)
+
+    def _take_poses(self, outcome: StageResults, truth: TruthFrame, stamps: list[int]) -> None:
+        estimated = {r.frame.key.stamp: r.pose for r in outcome.aligned.references}
+        for reference in outcome.paired.references:
+            stamp = reference.frame.key.stamp
+            errors = self._score.poses[stamps.index(truth.stamp) - stamps.index(stamp)]
+            if stamp not in estimated:
+                errors.lost += 1
+                continue
+            turn, direction = pose_errors(estimated[stamp],
+                                          true_pose(self._frames[stamp], truth))
+            errors.rotation.append(turn)
+            errors.direction.append(direction)
+
+
+class Contest:
+    """Runs every method on the same sequences."""
+
+    def __init__(self, methods: Mapping[str, Method]) -> None:
+        self._methods = methods
+        self._results = {name: MethodScore() for name in methods}
+
+    def add(self, sequence: Sequence[TruthFrame], skip: int,
+            advance: Callable[[], object] = lambda: None) -> None:
+        """All methods over one sequence; the first `skip` frames (at least 1) are not scored.
+
+        advance : called after each frame
+        """
+        frames: dict[int, TruthFrame] = {}
+        runs = [_Run(method, frames, self._results[name])
+                for name, method in self._methods.items()]
+        for index in range(len(sequence)):
+            truth = sequence[index]
+            frames[truth.stamp] = truth
+            for run in runs:
+                run.add(truth, counts=index >= max(skip, 1))
+            advance()
 
     def summaries(self) -> dict[str, dict[str, Any]]:
         """By method."""
-        return {name: result.summary() for name, result in self.results.items()}
+        return {name: result.summary() for name, result in self._results.items()}
 
 
-def table(summaries: Mapping[str, Mapping[str, Any]]) -> str:
-    """Lines for people: one method a row."""
-    head = f'{"method":10}{"rotation°":>11}{"direction°":>11}'
-    head += ''.join(f'{f"{low:g}–{high:g} m":>21}' for low, high in BANDS)
-    head += f'{"danger %":>10}{"ghost %":>9}'
-    rows = [head, f'{"":32}' + f'{"cov% / med% / >10%":>21}' * len(BANDS)]
-    for name, s in summaries.items():
-        if not s['pairs']:
-            rows.append(f'{name:10} no depth: {s["drops"]}')
-            continue
-        row = f'{name:10}{s["rotation_deg"]:11.4f}{s["direction_deg"]:11.4f}'
-        for low, high in BANDS:
-            band = s[f'{low:g}-{high:g}']
-            parts = (band['coverage'], band['median'], band['bad'])
-            row += f'{" / ".join("–" if p is None else f"{p:.3g}" for p in parts):>21}'
-        rows.append(row + f'{s["danger"]:10.2f}{s["ghost"]:9.2f}')
-    return '\n'.join(rows)
+def frames_to_skip(length: int, wanted: int | None) -> int:
+    """How many frames of a sequence are not scored: as wanted, else 10, or half of a short one."""
+    if wanted is not None:
+        return wanted
+    return SKIPPED if length > SKIPPED else length // 2

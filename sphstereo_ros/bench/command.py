@@ -4,7 +4,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,25 +11,17 @@ from tqdm import tqdm
 
 from sphstereo_ros.replay.parameter_files import load_values
 from sphstereo_ros.replay.records import BadInput
-from sphstereo_ros.scenes.sequence import REPORTED_SEEDS, SCENES, load_sequence, render_sequence
+from sphstereo_ros.scenes.sequence import REPORTED_SEEDS, SCENES
 
-from .methods import METHODS, parameters
+from .methods import COMPARED, METHODS, method
+from .sequences import GROUND_TRUTH, Scenes, saved
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     kinds = parser.add_subparsers(dest='kind', required=True, metavar='accuracy|speed|live')
     accuracy = kinds.add_parser('accuracy', help='pose and range against exact truth')
-    accuracy.add_argument('--sequence', type=Path, nargs='+', metavar='FOLDER',
-                          help='frames with truth, as `sphstereo scene` writes them '
-                          '(default: scenes are rendered)')
-    accuracy.add_argument('--scene', choices=SCENES, default='street', help='to be rendered')
-    accuracy.add_argument('--seeds', type=int, nargs='+', default=REPORTED_SEEDS, metavar='SEED',
-                          help='of the scenes to be rendered (default: %(default)s)')
-    accuracy.add_argument('--frames', type=int, default=3, help='of each (default: %(default)s)')
-    accuracy.add_argument('--interval', type=int, default=1, help='frames between the views')
-    accuracy.add_argument('--methods', default=','.join(METHODS),
-                          help='of %(default)s (default: all)')
+    _add_accuracy(accuracy)
     speed = kinds.add_parser('speed', help='the chain against one StereoBM call')
     speed.add_argument('--input', type=Path, metavar='IN',
                        help='bag, video or folder of frames (default: the sample bag)')
@@ -46,6 +37,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     live_bench.add_arguments(live)
 
 
+def _add_accuracy(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('folders', type=Path, nargs='*', metavar='FOLDER',
+                        help='frames with truth, as `sphstereo scene` writes them; also looked '
+                        f'for in ${GROUND_TRUTH} (default: scenes are rendered)')
+    parser.add_argument('--scene', choices=SCENES, default='street', help='to be rendered')
+    parser.add_argument('--nuisance', help='what makes the scene harder, by name')
+    parser.add_argument('--seeds', type=int, nargs='+', default=REPORTED_SEEDS, metavar='SEED',
+                        help='of the scenes to be rendered (default: %(default)s)')
+    parser.add_argument('--frames', type=int, default=14, help='of each (default: %(default)s)')
+    parser.add_argument('--skip', type=int, help='frames of each that are not scored '
+                        '(default: 10; half of a shorter sequence)')
+    parser.add_argument('--cache', type=Path, metavar='DIR', help='keep what is rendered here, '
+                        'and take it from here the next time')
+    parser.add_argument('--methods', default=','.join(COMPARED),
+                        help=f'of {",".join(METHODS)} (default: %(default)s)')
+    parser.add_argument('--params', type=Path, action='append', default=[], metavar='FILE',
+                        help='parameters of the method `default`')
+    parser.add_argument('-p', action='append', default=[], dest='overrides',
+                        metavar='NAME:=VALUE', help='the same, one by one')
+
+
 def main(args: argparse.Namespace) -> int:
     """Run one benchmark; returns the exit status."""
     if args.kind == 'live':
@@ -53,53 +65,53 @@ def main(args: argparse.Namespace) -> int:
         return int(live.main(args))
     result = _accuracy(args) if args.kind == 'accuracy' else _speed(args)
     if args.json:
-        print(json.dumps(result))
+        print(json.dumps(_rounded(result)))
     return 0
 
 
-def _sequences(args: argparse.Namespace) -> Iterator[Sequence[Any]]:
-    for folder in args.sequence or ():
-        try:
-            yield load_sequence(folder)
-        except (OSError, ValueError) as error:
-            raise BadInput(f'{folder}: {error}') from error
-    try:
-        for seed in () if args.sequence else args.seeds:
-            yield render_sequence(args.scene, seed, args.frames, args.height)
-    except ImportError as error:
-        raise BadInput(f"rendering needs the extra 'scenes': {error}") from error
+def _rounded(value: Any) -> Any:
+    """Numbers to five digits, however deep."""
+    if isinstance(value, dict):
+        return {name: _rounded(item) for name, item in value.items()}
+    return float(f'{value:.5g}') if isinstance(value, float) else value
 
 
 def _accuracy(args: argparse.Namespace) -> dict[str, Any]:
-    from .accuracy import Contest, pairs, table
+    from .accuracy import Contest, frames_to_skip
+    from .tables import tables
     names = args.methods.split(',')
     unknown = sorted(set(names) - set(METHODS))
     if unknown:
         raise BadInput(f'--methods: {unknown[0]} is none of {", ".join(METHODS)}')
-    contest = Contest({name: parameters(name) for name in names})
-    for sequence in _sequences(args):
-        total = max(len(sequence) - args.interval, 0)
-        for reference, current in tqdm(pairs(sequence, args.interval), total=total, unit='pair'):
-            contest.add(reference, current)
+    given = load_values(args.params, args.overrides)
+    contest = Contest({name: method(name, given) for name in names})
+    scenes = Scenes(args.scene, args.seeds, args.frames, args.height, args.nuisance, args.cache)
+    for sequence in saved(args.folders) if args.folders else scenes.sequences():
+        with tqdm(total=len(sequence), unit='frame', disable=None) as progress:
+            contest.add(sequence, frames_to_skip(len(sequence), args.skip), progress.update)
     summaries = contest.summaries()
-    print(table(summaries))
+    print(tables(summaries))
     return summaries
 
 
 def _speed(args: argparse.Namespace) -> dict[str, Any]:
     from .live import frames
     from .processes import shipped
-    from .speed import measure, stage_times
+    from .speed import measure, one_reference, stage_times, window_cost
     images = frames(args.input or shipped('bags/street.mcap'), args.height, colour=False)
-    given = {'stereo.matcher': 'bm', **load_values(args.params, args.overrides)}
+    own = load_values(args.params, args.overrides)
+    given = one_reference({'stereo.matcher': 'bm', **own})
     stages = stage_times(images, given)
-    result = measure(images, given, args.pairs)
+    result = {**measure(images, given, args.pairs), **window_cost(images, own, args.pairs)}
     for name, value in stages.items():
         print(f'{name:20}{value:8.1f} ms')
     print(f'{"whole chain":20}{result["chain_ms"]:8.1f} ms\n'
           f'{"StereoBM(96, 15)":20}{result["bm_ms"]:8.1f} ms\n'
           f'{"ratio":20}{result["ratio"]:8.2f}    ({result["pairs"]} pairs)')
+    if result['window_ratio'] is not None:
+        print(f'{"full window":20}{result["window_ms"]:8.1f} ms\n'
+              f'{"one reference":20}{result["single_ms"]:8.1f} ms\n'
+              f'{"ratio":20}{result["window_ratio"]:8.2f}')
     if result['dropped']:
         print(f'dropped: {result["dropped"]}', file=sys.stderr)
     return {**result, 'stages_ms': stages}
-

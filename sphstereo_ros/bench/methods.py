@@ -2,19 +2,49 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 from sphstereo_ros.replay.parameter_files import load_values
 
 from .processes import shipped
 
-MATCHERS = ('flow', 'flow_fast', 'bm', 'sgbm')
-# Methods that are parameter files: the paper's, and what a small computer runs live.
-FILES = {'paper': 'config/paper.yaml', 'live': 'config/live.yaml'}
-METHODS = ('default', *MATCHERS, *FILES)
+MATCHERS = ('hybrid', 'flow', 'flow_fast', 'bm', 'sgbm')
+ONE_REFERENCE: Mapping[str, object] = {'pairing.intervals': [1]}
 
 
-def parameters(method: str) -> Mapping[str, object]:
-    """The parameters of one of METHODS, over the defaults."""
-    if method in FILES:
-        return load_values([shipped(FILES[method])])
-    return {} if method == 'default' else {'stereo.matcher': method}
+@dataclass(frozen=True)
+class Method:
+    """Parameters over the defaults.
+
+    true_pose : stages 2 and 3 are replaced by the truth
+    remembers : frames before the scored ones matter (else only pairing sees them)
+    """
+
+    parameters: Mapping[str, object]
+    true_pose: bool = False
+    remembers: bool = False
+
+
+def _file(name: str) -> Mapping[str, object]:
+    return load_values([shipped(name)])
+
+
+# What is compared by default: the paper's method, block matching at its best, one reference, the
+# full window, and what a small computer runs live. A matcher's name is the full window with it.
+COMPARED = ('paper', 'sgbm_true_pose', 'one_reference', 'default', 'live')
+METHODS = (*COMPARED, *MATCHERS)
+
+
+def method(name: str, overrides: Mapping[str, object] | None = None) -> Method:
+    """One of METHODS; `overrides` are parameters of the method `default` alone."""
+    if name == 'paper':
+        return Method({**ONE_REFERENCE, **_file('config/paper.yaml')})
+    if name == 'sgbm_true_pose':
+        return Method({**ONE_REFERENCE, 'stereo.matcher': 'sgbm'}, true_pose=True)
+    if name == 'one_reference':
+        return Method(ONE_REFERENCE, remembers=True)
+    if name == 'live':
+        return Method(_file('config/live.yaml'), remembers=True)
+    if name in MATCHERS:
+        return Method({'stereo.matcher': name}, remembers=True)
+    return Method(overrides or {}, remembers=True)
