@@ -5,7 +5,7 @@ the meridians is the error of rotation and direction, and it is solved for over 
 """
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,39 +13,108 @@ from numpy.typing import NDArray
 from . import relative_pose
 from .camera import Equirectangular
 from .config import AlignmentConfig, Config
-from .frames import AlignedWindow, Drop, Frame, Image8, Reference, RelativePose, StabilisedWindow
+from .frames import (
+    AlignedWindow,
+    Drop,
+    Frame,
+    FrameKey,
+    Image8,
+    Reference,
+    RelativePose,
+    StabilisedWindow,
+)
+from .history import PoseHistory, with_baseline
 from .paper import window_ratio_direction
 from .relative_pose import Correspondences, PoseEstimate, epipolar_residuals, refine
-from .sphere import polar_bearings
+from .sphere import polar_angles, polar_axes, polar_bearings
 from .stabilisation import reduced, with_length
 from .tracking import Points, features, follow, spacing_for
-from .warp import PolarGrid, aligned_pair
+from .warp import PolarGrid, polar_map, resample, with_border
 
 Floats = NDArray[np.float64]
 
 _MARGIN, _WRAP = 8, 8
 _POLE = 0.1  # rad round both poles, where the grid is too stretched to track
+# A farther reference sees a point at another distance and from another side; still to be followed.
+_STRETCH, _FARTHEST = 1.4, 0.45
 
 
-def aligned_correspondences(reference: Image8, current: Image8, pose: RelativePose,
-                            grid: PolarGrid, count: int) -> Correspondences:
-    """Features followed between the views on the polar grid, back as bearings of each view.
+@dataclass(frozen=True)
+class CurrentView:
+    """The current frame on the polar grid about one direction of motion, and its features.
 
-    count : so many features at most, about
+    axes : (3, 3) of the grid; image : (rows, columns) uint8; points : (N, 2) float32 pixels;
+    sigma : (N,) px, expected error of following each; bearings : (N, 3), current optical frame;
+    nearness : (N,) 1/m, the inverse range of each, as far as it is known (else NaN)
     """
-    ref, cur, axes = aligned_pair(reference, current, pose, grid)
+
+    grid: PolarGrid
+    axes: Floats
+    image: Image8
+    points: Points
+    sigma: Floats
+    bearings: Floats
+    nearness: Floats
+
+    def bearings_of(self, pixels: Points) -> Floats:
+        """Pixels (N, 2) of the grid → bearings (N, 3) along the current camera's axes."""
+        offset = np.array([self.grid.margin, self.grid.wrap]) - 0.5
+        theta, azimuth = ((pixels - offset) * self.grid.pixel).T
+        return polar_bearings(theta, azimuth, self.axes)
+
+    def pixels_of(self, bearings: Floats, beside: Points) -> Floats:
+        """Bearings (N, 3) → pixels (N, 2), on the turn of the azimuth nearest to `beside`."""
+        pixels = polar_angles(bearings, self.axes) / self.grid.pixel \
+            + (np.array([self.grid.margin, self.grid.wrap]) - 0.5)
+        turn = 2 * self.grid.height
+        pixels[:, 1] += turn * np.round((beside[:, 1] - pixels[:, 1]) / turn)
+        return pixels
+
+
+def current_view(current: Image8, direction: Floats, grid: PolarGrid, count: int) -> CurrentView:
+    """Resample the current frame about `direction` and choose its features, at most about `count`.
+    """
+    axes = polar_axes(direction)
+    image = resample(with_border(current), polar_map(grid, axes, current.shape))
     inside = np.zeros(grid.shape, bool)
     inside[grid.wrap:-grid.wrap, np.sin(grid.theta()) > np.sin(_POLE)] = True
-    points, sigma = features(cur, spacing_for(count, grid.height), inside)
-    moved, found = follow(cur, ref, points)
-    offset = np.array([grid.margin, grid.wrap]) - 0.5
+    points, sigma = features(image, spacing_for(count, grid.height), inside)
+    view = CurrentView(grid, axes, image, points, sigma, np.zeros((0, 3)),
+                       np.full(len(points), np.nan))
+    return replace(view, bearings=view.bearings_of(points))
 
-    def bearings(pixels: Points) -> Floats:
-        theta, azimuth = ((pixels[found] - offset) * grid.pixel).T
-        return polar_bearings(theta, azimuth, axes)
 
-    return Correspondences(bearings(moved) @ pose.rotation, bearings(points),
-                           sigma[found] * grid.pixel)
+def followed(view: CurrentView, reference: Image8, pose: RelativePose,
+             ) -> tuple[Correspondences, NDArray[np.intp]]:
+    """Features of `view` found in the reference image, and which they are.
+
+    Where ranges of features are known, those are followed from where the pose and the range say
+    that they are, unless they look too different from there; else all from where they would be
+    at infinity.
+    """
+    image = resample(with_border(reference),
+                     polar_map(view.grid, pose.rotation.T @ view.axes, reference.shape))
+    chosen = np.arange(len(view.points))
+    guess = None
+    expected = view.bearings - view.nearness[:, None] * pose.position
+    if np.isfinite(view.nearness).any():
+        stretch = np.linalg.norm(expected, axis=1)
+        alike = (stretch > 1 / _STRETCH) & (stretch < _STRETCH)
+        alike &= np.einsum('na,na->n', expected, view.bearings) > np.cos(_FARTHEST) * stretch
+        chosen = np.nonzero(alike)[0]
+        guess = view.pixels_of(expected[chosen], view.points[chosen])
+    moved, found = follow(view.image, image, view.points[chosen], guess=guess)
+    chosen = chosen[found]
+    return Correspondences(view.bearings_of(moved[found]) @ pose.rotation, view.bearings[chosen],
+                           view.sigma[chosen] * view.grid.pixel), chosen
+
+
+def nearness(points: Correspondences, pose: RelativePose) -> Floats:
+    """Inverse range (N,) of each point from the current camera, 1/m; negative behind it."""
+    seen = points.reference @ pose.rotation.T
+    lever = np.cross(seen, pose.position)
+    return np.asarray(np.einsum('na,na->n', np.cross(seen, points.current), lever)
+                      / np.maximum(np.einsum('na,na->n', lever, lever), 1e-300))
 
 
 class Aligner:
@@ -54,54 +123,110 @@ class Aligner:
     def __init__(self, config: Config, mask: Image8 | None = None) -> None:
         self.config: AlignmentConfig = config.alignment
         self._mask = mask
+        self._history = PoseHistory()
 
     def warm_up(self) -> None:
         """Compile what `process` needs."""
         noise = np.random.default_rng(0).integers(0, 255, (64, 128), np.uint8)
         pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -1.0]))
-        aligned_correspondences(noise, noise, pose, PolarGrid(64, _MARGIN, _WRAP), 500)
+        view = current_view(noise, pose.direction, PolarGrid(64, _MARGIN, _WRAP), 500)
+        followed(view, noise, pose)
         relative_pose.warm_up()
 
     def process(self, window: StabilisedWindow) -> AlignedWindow | Drop:
         """Refine every reference's pose; those that fail are left out.
 
+        The nearest starts from where stage 2 put it. Farther ones start at the end of the poses
+        found for earlier windows, where these lead there.
+
         If none is left, the nearest one's failure is returned: `alignment_failed`.
         """
-        done = [self._reference(window.current, r) for r in window.references]
+        if self.config.method == 'paper':
+            done = [self._by_window_ratio(window.current, r) for r in window.references]
+        else:
+            done = self._refined_window(window)
         good = tuple(r for r in done if isinstance(r, Reference))
         if good:
             return AlignedWindow(window.current, good)
         return next(d for d in done if isinstance(d, Drop))
 
-    def _reference(self, current: Frame, reference: Reference) -> Reference | Drop:
-        height = min(self.config.working_height, current.image.shape[0])
-        # Shrinking by a little only blurs: the grid samples the frame itself then.
-        images = [f.image if f.image.shape[0] < 1.3 * height else reduced(f.image, height)
-                  for f in (reference.frame, current)]
-        if self.config.method == 'paper':
-            pose = window_ratio_direction(images[0], images[1], reference.pose)
-            return replace(reference, pose=pose) if isinstance(pose, RelativePose) else pose
-        grid = PolarGrid(height, _MARGIN, _WRAP)
-        pose = reference.pose
-        for _ in range(self.config.iterations):
-            points = self._beside_mask(aligned_correspondences(
-                images[0], images[1], pose, grid, self.config.max_points))
-            refined = self._refined(points, pose, grid.pixel)
-            if isinstance(refined, Drop):
-                return refined
-            pose = with_length(refined, reference.pose)
-        return replace(reference, pose=self._with_floor(pose))
+    def _reduced(self, image: Image8) -> Image8:
+        """The image at working height; the grid samples the frame itself where it is little more.
+        """
+        height = self.config.working_height
+        return image if image.shape[0] < 1.3 * height else reduced(image, height)
 
-    def _beside_mask(self, points: Correspondences) -> Correspondences:
-        """Those that neither view sees on the vehicle."""
-        if self._mask is None:
-            return points
-        height, width = self._mask.shape
+    def _by_window_ratio(self, current: Frame, reference: Reference) -> Reference | Drop:
+        pose = window_ratio_direction(self._reduced(reference.frame.image),
+                                      self._reduced(current.image), reference.pose)
+        return pose if isinstance(pose, Drop) else replace(reference, pose=pose)
+
+    def _refined_window(self, window: StabilisedWindow) -> list[Reference | Drop]:
+        key = window.current.key
+        self._history.begin(key)
+        image = self._reduced(window.current.image)
+        grid = PolarGrid(min(self.config.working_height, image.shape[0]), _MARGIN, _WRAP)
+        view: CurrentView | None = None
+        done: list[Reference | Drop] = []
+        for reference in window.references:
+            found = self._nearest(image, reference, grid) if view is None \
+                else self._farther(view, key, reference)
+            if isinstance(found, Drop):
+                done.append(found)
+                continue
+            view, pose = found
+            pose = self._with_floor(pose)
+            self._history.add(key, reference.frame.key, pose)
+            done.append(replace(reference, pose=pose))
+        return done
+
+    def _nearest(self, current: Image8, reference: Reference,
+                 grid: PolarGrid) -> tuple[CurrentView, RelativePose] | Drop:
+        """Refine on the grid about the reference's own direction."""
+        pose = reference.pose
+        view = current_view(current, pose.direction, grid, self.config.max_points)
+        for iteration in range(self.config.iterations):
+            if iteration:
+                view = current_view(current, pose.direction, grid, self.config.max_points)
+            found = self._step(view, reference, pose)
+            if isinstance(found, Drop):
+                return found
+            view, pose = found
+        return view, pose
+
+    def _farther(self, view: CurrentView, current: FrameKey,
+                 reference: Reference) -> tuple[CurrentView, RelativePose] | Drop:
+        """Refine from the end of a chain, with the features of the nearest reference's view."""
+        pose = reference.pose
+        chained = self._history.between(reference.frame.key, current)
+        if chained is not None and chained.baseline > 0.5 * pose.baseline:
+            pose = with_baseline(chained, pose.baseline)
+        return self._step(view, reference, pose) if self.config.iterations else (view, pose)
+
+    def _step(self, view: CurrentView, reference: Reference,
+              pose: RelativePose) -> tuple[CurrentView, RelativePose] | Drop:
+        """One refinement, and the view with the ranges that it told."""
+        points, index = followed(view, self._reduced(reference.frame.image), pose)
+        keep = self._beside_mask(points)
+        points, index = points[keep], index[keep]
+        refined = self._refined(points, pose, view.grid.pixel)
+        if isinstance(refined, Drop):
+            return refined
+        pose = with_length(refined, reference.pose)
+        known = view.nearness.copy()
+        known[index[refined.inliers]] = nearness(points[refined.inliers], pose)
+        return replace(view, nearness=known), pose
+
+    def _beside_mask(self, points: Correspondences) -> NDArray[np.bool_]:
+        """Which neither view sees on the vehicle, (N,)."""
         keep = np.ones(len(points), bool)
+        if self._mask is None:
+            return keep
+        height, width = self._mask.shape
         for bearings in (points.reference, points.current):
             u, v = np.rint(Equirectangular(height, width).project(bearings)).astype(np.intp).T
             keep &= self._mask[v.clip(0, height - 1), u % width] == 0
-        return points[keep]
+        return keep
 
     @staticmethod
     def _refined(points: Correspondences, pose: RelativePose,

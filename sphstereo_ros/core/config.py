@@ -112,8 +112,8 @@ class PairingConfig:
 
     mode: str = _p('pairing.mode', 'monocular', 'one moving camera', choices=('monocular',),
                    runtime=False)
-    intervals: tuple[int, ...] = _p('pairing.intervals', (1,), 'references, frames back', low=1,
-                                    high=100)
+    intervals: tuple[int, ...] = _p('pairing.intervals', (1, 4, 10),
+                                    'references, frames back', low=1, high=100)
     baselines: tuple[float, ...] = _p('pairing.baselines', (0.0,), 'references by distance '
                                       'instead of pairing.intervals; 0 = unused', unit='m',
                                       low=0.0, high=1000.0)

@@ -17,6 +17,7 @@ from .frames import (
     RelativePose,
     StabilisedWindow,
 )
+from .history import PoseHistory, with_baseline
 from .relative_pose import (
     Correspondences,
     PoseEstimate,
@@ -30,6 +31,7 @@ from .relative_pose import (
 from .tracking import match, track
 
 _BEHIND = 1 / 3  # largest share of points that moved, but behind the cameras
+_LIKELY = 0.5  # least length of a chain, as a share of what is believed
 _COARSE = 2.0  # parallax that matched descriptors must show, as a multiple of the threshold
 
 
@@ -91,6 +93,7 @@ class Stabiliser:
     def __init__(self, config: Config, mask: Image8 | None = None) -> None:
         self.config = config.pose
         self._mask = mask
+        self._history = PoseHistory()
 
     def warm_up(self) -> None:
         """Compile what `process` needs."""
@@ -101,13 +104,30 @@ class Stabiliser:
     def process(self, window: PairedWindow) -> StabilisedWindow | Drop:
         """Give every reference its rotation and direction; the baselines' lengths stay.
 
+        The nearest is estimated from the images. Where the poses found for earlier windows lead
+        to a farther one, it is predicted from them: stage 3 refines it.
+
         References that fail are left out; if none is left, the nearest one's failure is returned.
         """
-        done = [self._reference(window, reference) for reference in window.references]
+        self._history.begin(window.current.key)
+        done: list[Reference | Drop] = []
+        for reference in window.references:
+            predicted = self._predicted(window, reference) if done else None
+            outcome = predicted or self._reference(window, reference)
+            done.append(outcome)
+            if predicted is None and isinstance(outcome, Reference):
+                self._history.add(window.current.key, outcome.frame.key, outcome.pose)
         good = tuple(r for r in done if isinstance(r, Reference))
         if good:
             return StabilisedWindow(window.current, good)
         return next(d for d in done if isinstance(d, Drop))
+
+    def _predicted(self, window: PairedWindow, reference: Reference) -> Reference | None:
+        """The reference at the end of a chain of poses, if there is one as long as is believed."""
+        pose = self._history.between(reference.frame.key, window.current.key)
+        if pose is None or pose.baseline < _LIKELY * reference.pose.baseline:
+            return None
+        return replace(reference, pose=with_baseline(pose, reference.pose.baseline))
 
     def _reference(self, window: PairedWindow, reference: Reference) -> Reference | Drop:
         config = self.config

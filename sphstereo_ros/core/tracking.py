@@ -67,14 +67,22 @@ def features(image: Image8, spacing: int,
     return np.stack([u[keep], v[keep]], axis=1).astype(np.float32), sigma[keep].astype(float)
 
 
-def follow(source: Image8, target: Image8, points: Points, *,
-           levels: int = 3) -> tuple[Points, NDArray[np.bool_]]:
-    """Pyramidal Lucas–Kanade: where `points` (N, 2) of `source` are in `target`, and if found."""
+def follow(source: Image8, target: Image8, points: Points, *, levels: int = 3,
+           guess: Points | None = None) -> tuple[Points, NDArray[np.bool_]]:
+    """Pyramidal Lucas–Kanade: where `points` (N, 2) of `source` are in `target`, and if found.
+
+    guess : (N, 2), where they are expected
+    """
     if not len(points):
         return points, np.zeros(0, bool)
+    source_points = np.ascontiguousarray(points, np.float32).reshape(-1, 1, 2)
+    flags, start = 0, None
+    if guess is not None:
+        flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+        start = np.array(guess, np.float32, order='C').reshape(-1, 1, 2)
     found, status, _ = cv2.calcOpticalFlowPyrLK(
-        source, target, points[:, None], None, winSize=(_WINDOW, _WINDOW), maxLevel=levels,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.003))
+        source, target, source_points, start, winSize=(_WINDOW, _WINDOW), maxLevel=levels,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.003), flags=flags)
     return found[:, 0], status[:, 0].astype(bool)
 
 
