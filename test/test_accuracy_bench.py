@@ -10,13 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sphstereo_ros import cli
+from sphstereo_ros.bench import speed
 from sphstereo_ros.bench.accuracy import Contest, frames_to_skip
 from sphstereo_ros.bench.methods import COMPARED, METHODS, Method, method
 from sphstereo_ros.bench.scoring import average, compare, solid_angle, weighted_median
 from sphstereo_ros.bench.sequences import Scenes, saved
-from sphstereo_ros.bench.speed import window_cost
 from sphstereo_ros.bench.tables import tables
 from sphstereo_ros.core.camera import Equirectangular
+from sphstereo_ros.core.chain import StageResults
 from sphstereo_ros.replay.records import BadInput
 from sphstereo_ros.scenes.sequence import TruthFrame, save_sequence
 
@@ -240,13 +241,23 @@ def test_short_sequences_are_scored_from_the_middle() -> None:
 
 # the window's cost
 
-def test_the_window_is_timed_beside_one_reference() -> None:
+def test_the_window_is_timed_beside_one_reference(monkeypatch) -> None:
     drive = [frame.image for frame in room.forward(5, STEP, 120)]
     given_ = {**FAST, 'baseline.length': STEP, 'pairing.intervals': [1, 2, 3]}
-    cost = window_cost(drive, given_, 4)
-    assert cost['window_ratio'] == pytest.approx(cost['window_ms'] / cost['single_ms'])
-    assert 1.2 < cost['window_ratio'] < 6
-    assert window_cost(drive, {**given_, 'pairing.intervals': [1, 9]}, 4)['window_ratio'] is None
+    clock, add_frame = [0.0], speed.Chain.add_frame
+
+    def a_second_a_reference(chain, frame):
+        outcomes = add_frame(chain, frame)
+        clock[0] += sum(len(o.aligned.references) for o in outcomes
+                        if isinstance(o, StageResults))
+        return outcomes
+
+    monkeypatch.setattr(speed.Chain, 'add_frame', a_second_a_reference)
+    monkeypatch.setattr(speed.time, 'perf_counter', lambda: clock[0])
+    assert speed.window_cost(drive, given_, 4) == {
+        'window_ms': 3000, 'single_ms': 1000, 'window_ratio': 3}
+    far = {**given_, 'pairing.intervals': [1, 9]}
+    assert speed.window_cost(drive, far, 4)['window_ratio'] is None
 
 
 # sequences and command
