@@ -137,7 +137,7 @@ class _Run:
         stamps = list(self._frames)
         before = self._frames[stamps[stamps.index(truth.stamp) - 1]]
         score = partial(compare, truth=truth.range, direction=true_pose(before, truth).direction,
-                        moving=getattr(truth, 'moving', None))
+                        moving=truth.moving)
         if isinstance(outcome, Drop):  # nothing is known of the whole sphere
             self._score.drops[outcome.cause] += 1
             height = self._chain.config.stereo.working_height or len(truth.image)

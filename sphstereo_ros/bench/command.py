@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from sphstereo_ros.replay.parameter_files import load_values
 from sphstereo_ros.replay.records import BadInput
-from sphstereo_ros.scenes.sequence import REPORTED_SEEDS, SCENES
+from sphstereo_ros.scenes.sequence import NUISANCES, REPORTED_SEEDS, SCENES
 
 from .methods import COMPARED, METHODS, method
 from .sequences import GROUND_TRUTH, Scenes, saved
@@ -42,7 +42,7 @@ def _add_accuracy(parser: argparse.ArgumentParser) -> None:
                         help='frames with truth, as `sphstereo scene` writes them; also looked '
                         f'for in ${GROUND_TRUTH} (default: scenes are rendered)')
     parser.add_argument('--scene', choices=SCENES, default='street', help='to be rendered')
-    parser.add_argument('--nuisance', help='what makes the scene harder, by name')
+    parser.add_argument('--nuisance', choices=NUISANCES, help='what makes the scene harder')
     parser.add_argument('--seeds', type=int, nargs='+', default=REPORTED_SEEDS, metavar='SEED',
                         help='of the scenes to be rendered (default: %(default)s)')
     parser.add_argument('--frames', type=int, default=14, help='of each (default: %(default)s)')

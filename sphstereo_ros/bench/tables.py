@@ -19,10 +19,8 @@ def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
                                        zip(line, widths, strict=True)) + ' |' for line in lines)
 
 
-def _number(value: float | None, digits: int = 2) -> str:
-    if value is None:
-        return '–'
-    return f'{value:.0f}' if abs(value) >= 10**digits else f'{value:.{digits}g}'
+def _number(value: float | None) -> str:
+    return '–' if value is None else f'{float(f"{value:.3g}"):g}'
 
 
 def _cell(group: Mapping[str, Any], *names: str) -> str:
