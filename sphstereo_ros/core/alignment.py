@@ -26,10 +26,11 @@ from .frames import (
 from .history import PoseHistory, with_baseline
 from .paper import window_ratio_direction
 from .relative_pose import Correspondences, PoseEstimate, epipolar_residuals, refine
-from .sphere import polar_angles, polar_axes, polar_bearings
+from .relief import nearness_map, reference_in_relief, sampled
+from .sphere import polar_axes, polar_bearings
 from .stabilisation import reduced, with_length
-from .tracking import Points, features, follow, spacing_for
-from .warp import PolarGrid, polar_map, resample, with_border
+from .tracking import Points, features, follow_both_ways, spacing_for
+from .warp import Map, PolarGrid, polar_map, resample, with_border
 
 Floats = NDArray[np.float64]
 
@@ -62,14 +63,6 @@ class CurrentView:
         theta, azimuth = ((pixels - offset) * self.grid.pixel).T
         return polar_bearings(theta, azimuth, self.axes)
 
-    def pixels_of(self, bearings: Floats, beside: Points) -> Floats:
-        """Bearings (N, 3) → pixels (N, 2), on the turn of the azimuth nearest to `beside`."""
-        pixels = polar_angles(bearings, self.axes) / self.grid.pixel \
-            + (np.array([self.grid.margin, self.grid.wrap]) - 0.5)
-        turn = 2 * self.grid.height
-        pixels[:, 1] += turn * np.round((beside[:, 1] - pixels[:, 1]) / turn)
-        return pixels
-
 
 def current_view(current: Image8, direction: Floats, grid: PolarGrid, count: int) -> CurrentView:
     """Resample the current frame about `direction` and choose its features, at most about `count`.
@@ -88,25 +81,40 @@ def followed(view: CurrentView, reference: Image8, pose: RelativePose,
              ) -> tuple[Correspondences, NDArray[np.intp]]:
     """Features of `view` found in the reference image, and which they are.
 
-    Where ranges of features are known, those are followed from where the pose and the range say
-    that they are, unless they look too different from there; else all from where they would be
-    at infinity.
+    The reference is resampled as if all were at infinity or, where `view` knows ranges, by them:
+    then what would look too different from there is left out.
     """
-    image = resample(with_border(reference),
-                     polar_map(view.grid, pose.rotation.T @ view.axes, reference.shape))
-    chosen = np.arange(len(view.points))
-    guess = None
-    expected = view.bearings - view.nearness[:, None] * pose.position
-    if np.isfinite(view.nearness).any():
-        stretch = np.linalg.norm(expected, axis=1)
-        alike = (stretch > 1 / _STRETCH) & (stretch < _STRETCH)
-        alike &= np.einsum('na,na->n', expected, view.bearings) > np.cos(_FARTHEST) * stretch
-        chosen = np.nonzero(alike)[0]
-        guess = view.pixels_of(expected[chosen], view.points[chosen])
-    moved, found = follow(view.image, image, view.points[chosen], guess=guess)
-    chosen = chosen[found]
-    return Correspondences(view.bearings_of(moved[found]) @ pose.rotation, view.bearings[chosen],
+    if not np.isfinite(view.nearness).any():
+        image = resample(with_border(reference), polar_map(
+            view.grid, pose.rotation.T @ view.axes, reference.shape))
+        moved, found = follow_both_ways(view.image, image, view.points)
+        chosen = np.nonzero(found)[0]
+        seen = view.bearings_of(moved[found])
+    else:
+        relief = nearness_map(view.grid, view.points, view.nearness)
+        image = reference_in_relief(reference, pose, view.grid, view.axes, relief)
+        chosen = np.nonzero(_alike(_seen(view.bearings, relief, view.points, pose),
+                                   view.bearings))[0]
+        moved, found = follow_both_ways(view.image, image, view.points[chosen])
+        moved, chosen = moved[found], chosen[found]
+        seen = _seen(view.bearings_of(moved), relief, moved, pose)
+        seen /= np.linalg.norm(seen, axis=1, keepdims=True)
+    return Correspondences(seen @ pose.rotation, view.bearings[chosen],
                            view.sigma[chosen] * view.grid.pixel), chosen
+
+
+def _seen(bearings: Floats, relief: Map, pixels: Points, pose: RelativePose) -> Floats:
+    """Where the reference camera sees what the relief has at `pixels`: vectors (N, 3), current
+    axes, in units of the range from the current camera.
+    """
+    return np.asarray(bearings - sampled(relief, pixels)[:, None] * pose.position)
+
+
+def _alike(seen: Floats, bearings: Floats) -> NDArray[np.bool_]:
+    """Which points (N,) both cameras see from about the same side and distance."""
+    length = np.linalg.norm(seen, axis=1)
+    turned = np.einsum('na,na->n', seen, bearings) / length
+    return np.asarray((np.abs(np.log(length)) < np.log(_STRETCH)) & (turned > np.cos(_FARTHEST)))
 
 
 def nearness(points: Correspondences, pose: RelativePose) -> Floats:

@@ -11,6 +11,7 @@ from . import relative_pose
 from .config import Config, PoseConfig
 from .frames import (
     Drop,
+    FrameKey,
     Image8,
     PairedWindow,
     Reference,
@@ -94,6 +95,9 @@ class Stabiliser:
         self.config = config.pose
         self._mask = mask
         self._history = PoseHistory()
+        # Where no sensor measures them, all steps between frames are taken as equally long.
+        self._assumes_steps = config.baseline.source in ('fixed', 'speed')
+        self._stood_still: FrameKey | None = None
 
     def warm_up(self) -> None:
         """Compile what `process` needs."""
@@ -107,20 +111,35 @@ class Stabiliser:
         The nearest is estimated from the images. Where the poses found for earlier windows lead
         to a farther one, it is predicted from them: stage 3 refines it.
 
+        Where lengths are assumed, nothing older than a hover is a reference: the way from there is
+        shorter than assumed.
+
         References that fail are left out; if none is left, the nearest one's failure is returned.
         """
-        self._history.begin(window.current.key)
+        self._begin(window.current.key)
         done: list[Reference | Drop] = []
         for reference in window.references:
+            key = reference.frame.key
+            if self._stood_still is not None and key < self._stood_still:
+                done.append(Drop('no_parallax', 'a hover since then'))
+                continue
             predicted = self._predicted(window, reference) if done else None
             outcome = predicted or self._reference(window, reference)
             done.append(outcome)
-            if predicted is None and isinstance(outcome, Reference):
-                self._history.add(window.current.key, outcome.frame.key, outcome.pose)
+            if isinstance(outcome, Drop):
+                if outcome.cause == 'no_parallax' and self._assumes_steps:
+                    self._stood_still = window.current.key
+            elif predicted is None:
+                self._history.add(window.current.key, key, outcome.pose)
         good = tuple(r for r in done if isinstance(r, Reference))
         if good:
             return StabilisedWindow(window.current, good)
         return next(d for d in done if isinstance(d, Drop))
+
+    def _begin(self, current: FrameKey) -> None:
+        self._history.begin(current)
+        if self._stood_still is not None and current < self._stood_still:
+            self._stood_still = None
 
     def _predicted(self, window: PairedWindow, reference: Reference) -> Reference | None:
         """The reference at the end of a chain of poses, if there is one as long as is believed."""

@@ -24,6 +24,10 @@ _WINDOW = 11
 _GREY_SQUARED = (4 * 255 * _BLOCK / 8 / _BLOCK)**2 / 4
 _NOISE, _FLOOR, _WORST = 1.5 / _WINDOW, 0.1, 0.5
 
+# Of points followed both ways: px by which one may miss where it began; and the share kept of
+# them, those whose windows differ least.
+_FOUND_BACK, _ALIKE = 0.25, 0.75
+
 # Descriptors: the nearest must be nearer than the second by this factor; error of a match (px).
 _DISTINCT, _MATCHED = 0.8, 0.5
 
@@ -67,23 +71,42 @@ def features(image: Image8, spacing: int,
     return np.stack([u[keep], v[keep]], axis=1).astype(np.float32), sigma[keep].astype(float)
 
 
-def follow(source: Image8, target: Image8, points: Points, *, levels: int = 3,
-           guess: Points | None = None) -> tuple[Points, NDArray[np.bool_]]:
-    """Pyramidal Lucas–Kanade: where `points` (N, 2) of `source` are in `target`, and if found.
+def follow(source: Image8, target: Image8, points: Points, *,
+           levels: int = 3) -> tuple[Points, NDArray[np.bool_]]:
+    """Pyramidal Lucas–Kanade: where `points` (N, 2) of `source` are in `target`, and if found."""
+    moved, found, _ = _lucas_kanade(source, target, points, None, levels)
+    return moved, found
 
-    guess : (N, 2), where they are expected
+
+def follow_both_ways(source: Image8, target: Image8,
+                     points: Points) -> tuple[Points, NDArray[np.bool_]]:
+    """Like `follow`, but found are only those that look alike in both images and are found back.
+
+    At the edge of something near, a part of the window moves with what is behind: such a point is
+    followed to a wrong place, from which it is not found back.
     """
+    moved, found, unlike = _lucas_kanade(source, target, points, None, 3)
+    back, _, _ = _lucas_kanade(target, source, moved, points, 0)
+    found &= np.linalg.norm(back - points, axis=1) < _FOUND_BACK
+    if found.any():
+        found &= unlike <= np.quantile(unlike[found], _ALIKE)
+    return moved, found
+
+
+def _lucas_kanade(source: Image8, target: Image8, points: Points, guess: Points | None,
+                  levels: int) -> tuple[Points, NDArray[np.bool_], Points]:
+    """Points (N, 2) found in `target`, whether they are, and the mean difference in grey (N,)."""
     if not len(points):
-        return points, np.zeros(0, bool)
-    source_points = np.ascontiguousarray(points, np.float32).reshape(-1, 1, 2)
+        return points, np.zeros(0, bool), np.zeros(0)
     flags, start = 0, None
     if guess is not None:
         flags = cv2.OPTFLOW_USE_INITIAL_FLOW
         start = np.array(guess, np.float32, order='C').reshape(-1, 1, 2)
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        source, target, source_points, start, winSize=(_WINDOW, _WINDOW), maxLevel=levels,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.003), flags=flags)
-    return found[:, 0], status[:, 0].astype(bool)
+    found, status, unlike = cv2.calcOpticalFlowPyrLK(
+        source, target, np.ascontiguousarray(points, np.float32).reshape(-1, 1, 2), start,
+        winSize=(_WINDOW, _WINDOW), maxLevel=levels, flags=flags,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 10, 0.003))
+    return found[:, 0], status[:, 0].astype(bool), unlike[:, 0]
 
 
 def spacing_for(count: int, height: int) -> int:

@@ -13,7 +13,7 @@ from sphstereo_ros.core.config import PARAMETERS, Config, Parameter, ParameterEr
 NODE_PARAMETERS: dict[str, tuple[str, ...]] = {
     'frame_pairing': ('camera.model', 'camera.mount.', 'baseline.', 'pairing.',
                       'stereo.working_height', 'points.colour'),
-    'pose_stabilisation': ('pose.', 'camera.mask', 'pairing.'),
+    'pose_stabilisation': ('pose.', 'camera.mask', 'pairing.', 'baseline.source'),
     'motion_alignment': ('alignment.', 'camera.mask', 'pairing.'),
     'spherical_stereo': ('stereo.', 'range.', 'points.', 'camera.', 'baseline.relative_sigma',
                          'pairing.'),
