@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .block_matching import MAX_BLOCK, UNIQUE, block_match
 from .config import StereoConfig
 from .frames import Image8
 from .jit import kernel, rows_in_parallel
@@ -191,10 +192,17 @@ def _opencv_matcher(stereo: Any, disparities: int, block: int, bounds: Bounds) -
 
 
 def block_matcher(disparities: int, block: int) -> Matcher:
-    """OpenCV's StereoBM, as in the paper."""
-    stereo = cv2.StereoBM_create(disparities, block)
-    stereo.setUniquenessRatio(10)
-    return _opencv_matcher(stereo, disparities, block, _BOUNDS['bm'])
+    """StereoBM, as in the paper: compiled here, or OpenCV's where the window is too large."""
+    if block > MAX_BLOCK:
+        stereo = cv2.StereoBM_create(disparities, block)
+        stereo.setUniquenessRatio(UNIQUE)
+        return _opencv_matcher(stereo, disparities, block, _BOUNDS['bm'])
+
+    def match(current: Image8, reference: Image8) -> Parallax:
+        pixels = block_match(current, reference, disparities, block, UNKNOWN)
+        return Parallax(pixels, structure_sigma(current, _BOUNDS['bm']), signed=False)
+
+    return match
 
 
 def semi_global_matcher(disparities: int, block: int) -> Matcher:
