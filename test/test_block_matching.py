@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sphstereo_ros.core.block_matching import MAX_BLOCK, UNIQUE, block_match
+from sphstereo_ros.core.block_matching import CAP, MAX_BLOCK, UNIQUE, block_match
 from sphstereo_ros.core.config import PARAMETERS, StereoConfig
 from sphstereo_ros.core.matching import UNKNOWN, matcher
 
@@ -77,6 +77,7 @@ def test_images_lower_than_the_window_are_matched(height):
 
 def test_sums_of_the_largest_window_do_not_overflow():
     """Full contrast, as unlike as can be."""
+    assert MAX_BLOCK**2 * 2 * CAP < np.iinfo(np.uint16).max
     stripes = np.where(np.arange(200) % 8 < 4, 0, 255).astype(np.uint8)
     current = np.tile(stripes, (100, 1))
     reference = np.tile(np.roll(stripes, 2), (100, 1))

@@ -29,7 +29,9 @@ def _filter_rows(first: int, last: int, image: Image8, before: int,
     """Sobel's gradient along the row, cut to ±CAP, plus CAP; CAP where there is no image."""
     height, width = image.shape
     for i in range(first, last):
-        above, here, below = image[abs(i - 1)], image[i], image[min(i + 1, 2 * height - i - 3)]
+        above = image[i - 1] if i > 0 else image[min(1, height - 1)]
+        below = image[i + 1] if i < height - 1 else image[max(height - 2, 0)]
+        here = image[i]
         row = out[i, before + 1:]
         out[i, :] = CAP
         for j in range(width - 2):
