@@ -2,18 +2,29 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sphstereo_ros.core import rotations
 from sphstereo_ros.core.config import ParameterError, resolve
 from sphstereo_ros.core.frames import Drop, Frame, FrameKey, PairedWindow
 from sphstereo_ros.core.motion import ImuSample, OdometrySample, TwistSample
-from sphstereo_ros.core.pairing import MAX_FRAMES, MAX_WAITING, Outcome, Pairer, nearest_matches
+from sphstereo_ros.core.pairing import (
+    MAX_BYTES,
+    MAX_WAITING,
+    Outcome,
+    Pairer,
+    farthest_reference,
+    frame_bytes,
+    nearest_matches,
+)
 
 STEP = 33_333_333
+Sample = OdometrySample | TwistSample
 
 
 def frame(stamp: int, frame_id: str = 'camera_optical', height: int = 4) -> Frame:
@@ -200,12 +211,25 @@ def test_baselines_need_metres(given: dict[str, object]) -> None:
 
 def test_frames_kept_are_bounded() -> None:
     p = pairer(pairing__baselines=(500.0,), baseline__length=1.0)
-    for i in range(MAX_FRAMES + 50):
+    for i in range(150):
         p.add_frame(frame(i))
-    assert len(p._frames) == MAX_FRAMES
+    assert len(p._frames) == 100
     p.configure(resolve({'pairing.intervals': (2,)}))
     assert len(p._frames) == 2
-    assert window(p.add_frame(frame(999))) == (999, [(MAX_FRAMES + 48, 2e-6)])
+    assert window(p.add_frame(frame(999))) == (999, [(148, 2e-6)])
+
+
+def test_memory_of_frames_is_bounded() -> None:
+    config = resolve({'pairing.baselines': (1.0,), 'baseline.length': 0.1}).pairing
+    assert farthest_reference(config, 1) == 100
+    assert farthest_reference(config, MAX_BYTES // 7) == 7
+    assert farthest_reference(config, 2 * MAX_BYTES) == 1
+    config = resolve({'pairing.baselines': (1.0,), 'baseline.length': 0.1,
+                      'pairing.max_frames': 300}).pairing
+    assert farthest_reference(config, 1) == 300
+    assert farthest_reference(resolve({}).pairing, MAX_BYTES) == 10
+    colour = np.zeros((4, 8, 3), np.uint8)
+    assert frame_bytes(replace(frame(0), colour=colour)) == 4 * 8 * 4
 
 
 def test_the_pose_follows_parameters_at_run_time() -> None:
@@ -224,6 +248,82 @@ def test_nearest_match_is_the_nearest(distances: list[float], wanted: list[float
         if distances and want <= max(distances):
             best = min(abs(d - want) for d in distances)
             assert any(abs(distances[i] - want) == best for i in chosen)
+
+
+def sensed(source: str, i: int, places: list[float]) -> Sample:
+    """What tells that the vehicle is at `places[i]` at tick i; its speed changes at ticks."""
+    if source == 'odometry':
+        return odometry(i * STEP, places[i])
+    # Trapezoids between samples: half way the rate has the mean of both.
+    ahead = (places[i + 1] - places[i]) / (STEP / 1e9) if i + 1 < len(places) else 0.0
+    return TwistSample(i * STEP, np.array([ahead, 0, 0]), np.array([0.0, 0.0, 0.3]))
+
+
+@settings(deadline=None)
+@given(st.lists(st.sampled_from([0.0, 0.001, 0.03, 0.1, 0.28, 0.5, 1.7]), min_size=1,
+                max_size=40),
+       st.sampled_from([(0.3, 1.0, 3.0), (1.0,), (0.5, 0.6)]),
+       st.sampled_from(['odometry', 'twist', 'speed']))
+def test_references_are_as_far_as_wanted_whatever_the_speed(
+        steps: list[float], wanted: tuple[float, ...], source: str) -> None:
+    """Hover, walk and drive: each wanted baseline has the frame that is nearest to it, as far
+    back in time as that may be; what is not reached is left out.
+    """
+    p = pairer(pairing__baselines=wanted, baseline__source=source, baseline__speed=2.0,
+               camera__mount__x=0.4, pairing__max_gap=0.5)
+    places = [0.0, *np.cumsum(steps)]
+    for i in range(len(places)):
+        outcome = p.add_frame(frame(i * STEP))
+        if source != 'speed':
+            add = p.add_odometry if source == 'odometry' else p.add_twist
+            outcome += add(sensed(source, i, places))  # type: ignore[arg-type]
+        if i == 0:
+            assert cause(outcome) == 'first_frame'
+            continue
+        found = {e: p._priors.between(e * STEP, i * STEP, i - e) for e in range(i)}
+        apart = {e: pose.baseline for e, pose in found.items() if not isinstance(pose, Drop)}
+        if isinstance(outcome[0], Drop):
+            assert not apart or max(apart.values()) < min(wanted)
+            assert outcome[0].cause == ('no_reference' if apart else 'baseline_too_short')
+            continue
+        got = {r.frame.key.stamp // STEP: r.pose.baseline for r in outcome[0].references}
+        assert list(got.values()) == sorted(got.values())
+        assert got == pytest.approx({e: apart[e] for e in got}, abs=1e-9)
+        for want in wanted:
+            if want <= max(apart.values()):
+                nearest = min(abs(d - want) for d in apart.values())
+                assert min(abs(d - want) for d in got.values()) == pytest.approx(nearest, abs=1e-4)
+        assert len(got) <= len(wanted)
+
+
+@pytest.mark.parametrize('source', ['odometry', 'twist'])
+def test_distances_are_those_of_the_poses(source: str) -> None:
+    """Also with a lever arm and turns, and after a sample that comes late."""
+    p = pairer(pairing__baselines=(0.7,), baseline__source=source, camera__mount__x=1.5,
+               camera__mount__y=-0.3, baseline__minimum=0.0)
+    for i in range(20):
+        turned = rotations.exp((0.0, 0.0, 0.05 * i))
+        p.add_odometry(OdometrySample(i * STEP, np.array([0.1 * i, 0.02 * i * i, 0.0]), turned))
+        p.add_twist(TwistSample(i * STEP, np.array([0.1 * i, 0.3, 0.0]),
+                                np.array([0.0, 0.0, 0.1 * i])))
+    stamps = [i * STEP for i in range(18, 2, -1)]
+    for late in (False, True):
+        if late:
+            at = 18 * STEP + STEP // 2
+            p.add_odometry(OdometrySample(at, np.array([9.0, 9.0, 0.0]), np.eye(3)))
+            p.add_twist(TwistSample(at, np.array([40.0, 0.0, 0.0]), np.zeros(3)))
+        expected = [p._priors.between(s, 18 * STEP + 3 * STEP // 4, 1).baseline for s in stamps]
+        found = list(p._priors.distances(18 * STEP + 3 * STEP // 4, stamps))
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_beyond_the_reach_of_the_sensor_nothing_is_found() -> None:
+    p = pairer(pairing__baselines=(0.5,), baseline__source='odometry')
+    p.add_odometry(odometry(2 * STEP, 1.0))
+    p.add_odometry(odometry(3 * STEP, 1.6))
+    stamps = [2 * STEP, STEP, 0]
+    assert list(p._priors.distances(3 * STEP, stamps)) == pytest.approx(
+        [0.6, np.nan, np.nan], nan_ok=True)
 
 
 EVENTS = st.one_of(

@@ -5,8 +5,9 @@ A prior is where the reference camera was, seen from the current one. Its length
 """
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Generic, Protocol, TypeVar
@@ -31,6 +32,8 @@ class _Stamped(Protocol):
 
 
 S = TypeVar('S', bound=_Stamped)
+K = TypeVar('K', bound=Hashable)
+V = TypeVar('V')
 
 
 class Track(Generic[S]):
@@ -182,6 +185,17 @@ def _growth(earlier: FloatArray | None, later: FloatArray | None) -> FloatArray 
     return None if not values.any() else np.asarray((vectors * values) @ vectors.T)
 
 
+def _twist_rate(sample: TwistSample) -> FloatArray:
+    return np.concatenate([sample.linear, sample.angular])
+
+
+def _remember(kept: dict[K, V], key: K, value: V) -> None:
+    """Add to what was computed once; the oldest go."""
+    kept[key] = value
+    while len(kept) > TRACK_SIZE:
+        del kept[next(iter(kept))]
+
+
 class MotionPriors:
     """Prior poses between any two stamps, from sensor tracks and parameters."""
 
@@ -190,12 +204,15 @@ class MotionPriors:
         self._odometry: Track[OdometrySample] = Track('odometry', gap)
         self._twist: Track[TwistSample] = Track('twist', gap)
         self._imu: Track[ImuSample] = Track('imu', gap)
+        self._positions: dict[int, FloatArray] = {}
+        self._steps: dict[tuple[int, int], BaseMotion] = {}
         self.configure(config)
 
     def configure(self, config: Config) -> None:
         """Take new parameters; the samples stay."""
         self._config = config.baseline
         self._mount = rotations.mount(config.camera)
+        self._forget_places()
         for track in (self._odometry, self._twist, self._imu):
             track.max_gap = round(config.pairing.max_gap * SECOND)
 
@@ -203,13 +220,13 @@ class MotionPriors:
         """Insert a sample of odometry."""
         if not (np.isfinite(sample.position).all() and np.isfinite(sample.rotation).all()):
             return Drop('odometry_invalid', 'pose is not finite')
-        return self._odometry.add(sample)
+        return self._added(self._odometry, sample)
 
     def add_twist(self, sample: TwistSample) -> Drop | None:
         """Insert a sample of velocity."""
         if not (np.isfinite(sample.linear).all() and np.isfinite(sample.angular).all()):
             return Drop('twist_invalid', 'velocity is not finite')
-        return self._twist.add(sample)
+        return self._added(self._twist, sample)
 
     def add_imu(self, sample: ImuSample) -> Drop | None:
         """Insert a sample of an IMU."""
@@ -217,9 +234,20 @@ class MotionPriors:
             return Drop('imu_invalid', 'neither orientation nor angular velocity')
         return self._imu.add(sample)
 
+    def _added(self, track: Track[S], sample: S) -> Drop | None:
+        """Insert a sample; what it adds to the past changes places there."""
+        if track.newest is not None and sample.stamp <= track.newest:
+            self._forget_places()
+        return track.add(sample)
+
+    def _forget_places(self) -> None:
+        self._positions.clear()
+        self._steps.clear()
+
     def time_jumped(self, stamp: int) -> None:
         """Forget the samples of a sensor that lies far after `stamp`: they are from before a jump.
         """
+        self._forget_places()
         for track in (self._odometry, self._twist, self._imu):
             if track.newest is not None and track.newest - stamp > track.max_gap:
                 track.clear()
@@ -254,6 +282,61 @@ class MotionPriors:
             return Drop('baseline_too_short', f'{pose.baseline:.4f} m')
         return pose
 
+    def distances(self, later: int, earlier: Iterable[int]) -> Iterator[float]:
+        """Metres between the camera at `later` and at each of `earlier` (ns, newest first).
+
+        NaN where the sensor does not tell, or tells of less than `baseline.minimum`.
+        """
+        config = self._config
+        if config.source == 'fixed':
+            yield from (config.length * back for back, _ in enumerate(earlier, start=1))
+            return
+        if config.source == 'speed':
+            yield from (config.speed * (later - stamp) / SECOND for stamp in earlier)
+            return
+        places = self._twist_places if config.source == 'twist' else self._odometry_places
+        for distance in places(later, earlier):
+            yield distance if distance >= config.minimum else math.nan
+
+    def _odometry_places(self, later: int, earlier: Iterable[int]) -> Iterator[float]:
+        here = self._camera_position(later)
+        for stamp in earlier:
+            there = self._camera_position(stamp)
+            yield math.nan if here is None or there is None \
+                else float(np.linalg.norm(here - there))
+
+    def _camera_position(self, stamp: int) -> FloatArray | None:
+        """The camera in `odom` at `stamp`, (3,) metres."""
+        if stamp not in self._positions:
+            pose = interpolate_odometry(self._odometry, stamp)
+            if pose is None:
+                return None
+            _remember(self._positions, stamp, pose.position + pose.rotation @ self._mount.position)
+        return self._positions[stamp]
+
+    def _twist_places(self, later: int, earlier: Iterable[int]) -> Iterator[float]:
+        rotation, position, stamp = np.eye(3), np.zeros(3), later
+        known = True
+        for before in earlier:
+            step = self._twist_step(before, stamp) if known else None
+            if step is None:
+                known = False
+                yield math.nan
+                continue
+            # The later base in the base at `before`.
+            position = step.position + step.rotation @ position
+            rotation = step.rotation @ rotation
+            stamp = before
+            yield camera_pose(BaseMotion(rotation, position), self._mount).baseline
+
+    def _twist_step(self, first: int, last: int) -> BaseMotion | None:
+        if (first, last) not in self._steps:
+            rates = mean_rates(self._twist, first, last, _twist_rate)
+            if rates is None:
+                return None
+            _remember(self._steps, (first, last), integrate_twist(rates))
+        return self._steps[first, last]
+
     def _assumed(self, earlier: int, later: int, length: float) -> RelativePose:
         """Forward by `length`."""
         pose = self._by_odometry(earlier, later)
@@ -278,8 +361,7 @@ class MotionPriors:
 
     def _by_twist(self, earlier: int, later: int,
                   odometry: RelativePose | None) -> RelativePose | None:
-        rates = mean_rates(self._twist, earlier, later,
-                           lambda s: np.concatenate([s.linear, s.angular]))
+        rates = mean_rates(self._twist, earlier, later, _twist_rate)
         if rates is None:
             return None
         pose = camera_pose(integrate_twist(rates), self._mount)

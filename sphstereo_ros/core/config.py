@@ -117,6 +117,8 @@ class PairingConfig:
     baselines: tuple[float, ...] = _p('pairing.baselines', (0.0,), 'references by distance '
                                       'instead of pairing.intervals; 0 = unused', unit='m',
                                       low=0.0, high=1000.0)
+    max_frames: int = _p('pairing.max_frames', 100, 'how many frames back pairing.baselines may '
+                         'reach; fewer where so many take more than 512 MB', low=1, high=1000)
     max_gap: float = _p('pairing.max_gap', 1.0, 'a longer gap between frames, or stamps that run '
                         'backward, empty the buffer', unit='s', low=0.001, high=3600.0)
 

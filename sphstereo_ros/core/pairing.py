@@ -4,16 +4,38 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 
+import numpy as np
+
 from sphstereo_ros.core.baseline import SECOND, MotionPriors
-from sphstereo_ros.core.config import Config
+from sphstereo_ros.core.config import Config, PairingConfig
 from sphstereo_ros.core.frames import Drop, Frame, PairedWindow, Reference, RelativePose
 from sphstereo_ros.core.motion import ImuSample, OdometrySample, TwistSample
 
 MAX_WAITING = 10
-# How many frames back a wanted baseline is looked for.
-MAX_FRAMES = 100
+# Memory for the frames among which a wanted baseline is looked for.
+MAX_BYTES = 512 * 2**20
 
 Outcome = PairedWindow | Drop
+
+
+def by_distance(config: PairingConfig) -> bool:
+    """Whether references are chosen by `baselines`, not by `intervals`."""
+    return config.baselines != (0.0,)
+
+
+def farthest_reference(config: PairingConfig, frame_bytes: int) -> int:
+    """How many frames back a reference may be: so many frames are kept.
+
+    frame_bytes : of one frame's images
+    """
+    if not by_distance(config):
+        return max(config.intervals)
+    return max(1, min(config.max_frames, MAX_BYTES // max(frame_bytes, 1)))
+
+
+def frame_bytes(frame: Frame) -> int:
+    """Memory of a frame's images."""
+    return frame.image.nbytes + (0 if frame.colour is None else frame.colour.nbytes)
 
 
 class Pairer:
@@ -35,10 +57,7 @@ class Pairer:
         """Take new parameters; frames and sensor samples stay."""
         self._config = config.pairing
         self._priors.configure(config)
-        by_distance = config.pairing.baselines != (0.0,)
-        self._wanted = config.pairing.baselines if by_distance else ()
-        size = MAX_FRAMES if by_distance else max(config.pairing.intervals)
-        self._frames = deque(self._frames, maxlen=size)
+        self._trim()
 
     def add_frame(self, frame: Frame) -> list[Outcome]:
         """Take the next frame of the camera."""
@@ -51,7 +70,7 @@ class Pairer:
             self._frames.clear()
             self._priors.time_jumped(frame.key.stamp)
             out.append(drop)
-            self._frames.append(frame)
+            self._keep(frame)
         else:
             self._waiting.append(frame)
             out = self._release()
@@ -78,8 +97,18 @@ class Pairer:
             sensor = self._priors.waits_for(frame.key.stamp)
             out.append(Drop(f'{sensor}_missing', 'none came while the frame waited') if sensor
                        else self._window(frame))
-            self._frames.append(frame)
+            self._keep(frame)
         return out
+
+    def _keep(self, frame: Frame) -> None:
+        self._frames.append(frame)
+        self._trim()
+
+    def _trim(self) -> None:
+        if self._frames:
+            size = farthest_reference(self._config, frame_bytes(self._frames[-1]))
+            while len(self._frames) > size:
+                self._frames.popleft()
 
     def _after(self, drop: Drop | None) -> list[Outcome]:
         return [*([] if drop is None else [drop]), *self._release()]
@@ -90,7 +119,7 @@ class Pairer:
                                  or not self._priors.waits_for(self._waiting[0].key.stamp)):
             frame = self._waiting.popleft()
             out.append(self._window(frame))
-            self._frames.append(frame)
+            self._keep(frame)
         return out
 
     def _discontinuity(self, frame: Frame) -> Drop | None:
@@ -113,7 +142,8 @@ class Pairer:
 
     def _window(self, frame: Frame) -> Outcome:
         """Pair `frame` with earlier ones, nearest first."""
-        found = self._by_distance(frame) if self._wanted else self._by_interval(frame)
+        found = self._by_distance(frame) if by_distance(self._config) \
+            else self._by_interval(frame)
         drops = [pose for _, pose in found if isinstance(pose, Drop)]
         references = [Reference(reference, pose) for reference, pose in found
                       if isinstance(pose, RelativePose)]
@@ -132,18 +162,19 @@ class Pairer:
 
     def _by_distance(self, frame: Frame) -> list[tuple[Frame, RelativePose | Drop]]:
         """The earlier frames whose distances are nearest to the wanted ones."""
-        found: list[tuple[Frame, RelativePose]] = []
-        drops: list[tuple[Frame, RelativePose | Drop]] = []
-        for back in range(1, len(self._frames) + 1):
-            reference, pose = self._prior(frame, back)
-            if isinstance(pose, Drop):
-                drops.append((reference, pose))
-                continue
-            found.append((reference, pose))
-            if pose.baseline > 2 * max(self._wanted):
-                break
-        chosen = nearest_matches([pose.baseline for _, pose in found], self._wanted)
-        return [found[i] for i in chosen] or ([] if found else drops)
+        wanted = self._config.baselines
+        backs: list[int] = []
+        distances: list[float] = []
+        stamps = [earlier.key.stamp for earlier in reversed(self._frames)]
+        for back, distance in enumerate(self._priors.distances(frame.key.stamp, stamps), start=1):
+            if np.isfinite(distance):
+                backs.append(back)
+                distances.append(distance)
+                if distance > 2 * max(wanted):
+                    break
+        if not backs:  # the sensor tells of none, or of a hover
+            return [self._prior(frame, 1)] if self._frames else []
+        return [self._prior(frame, backs[i]) for i in nearest_matches(distances, wanted)]
 
 
 def nearest_matches(distances: list[float], wanted: Iterable[float]) -> list[int]:
