@@ -3,7 +3,9 @@ from __future__ import annotations
 
 import threading
 import xml.etree.ElementTree as xml
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,9 +23,16 @@ from sphstereo_ros.core.frames import (
     Reference,
     RelativePose,
 )
+from sphstereo_ros.core.pairing import MAX_BYTES
 from sphstereo_ros.replay import bag_messages
-from sphstereo_ros.ros.conversions import WindowGeometry, odometry_message
+from sphstereo_ros.ros.conversions import (
+    WindowGeometry,
+    covariance_message,
+    read_window,
+    window_message,
+)
 from sphstereo_ros.ros.matching import (
+    MAX_COVARIANCES,
     MAX_PENDING,
     Covariances,
     WindowMatcher,
@@ -201,7 +210,7 @@ def stamps(decided: list[tuple[PairedWindow | Drop, float]]) -> list[object]:
 
 
 def test_window_waits_for_its_frames() -> None:
-    matcher = WindowMatcher(PairedWindow, 5)
+    matcher = WindowMatcher(PairedWindow, lambda _: 5)
     assert matcher.add_frame(frame(1)) == []
     assert matcher.add_window(geometry(2, 1), 7.5) == []
     (window, arrival), = matcher.add_frame(frame(2))
@@ -213,7 +222,7 @@ def test_window_waits_for_its_frames() -> None:
 
 
 def test_window_without_its_frame_is_dropped_when_a_later_one_is_complete() -> None:
-    matcher = WindowMatcher(PairedWindow, 5)
+    matcher = WindowMatcher(PairedWindow, lambda _: 5)
     matcher.add_frame(frame(2))
     assert matcher.add_window(geometry(2, 1), 0.0) == []
     assert matcher.add_frame(frame(3)) == []
@@ -221,7 +230,7 @@ def test_window_without_its_frame_is_dropped_when_a_later_one_is_complete() -> N
 
 
 def test_windows_that_wait_are_bounded() -> None:
-    matcher = WindowMatcher(PairedWindow, 5)
+    matcher = WindowMatcher(PairedWindow, lambda _: 5)
     decided = []
     for stamp in range(MAX_PENDING + 2):
         decided += matcher.add_window(geometry(stamp + 1, stamp), 0.0)
@@ -229,7 +238,7 @@ def test_windows_that_wait_are_bounded() -> None:
 
 
 def test_frames_kept_are_bounded() -> None:
-    matcher = WindowMatcher(PairedWindow, 3)
+    matcher = WindowMatcher(PairedWindow, lambda _: 3)
     for stamp in range(10):
         matcher.add_frame(frame(stamp))
     assert matcher.add_window(geometry(9, 6), 0.0) == []
@@ -237,7 +246,7 @@ def test_frames_kept_are_bounded() -> None:
 
 
 def test_another_frame_id_is_another_frame() -> None:
-    matcher = WindowMatcher(PairedWindow, 3)
+    matcher = WindowMatcher(PairedWindow, lambda _: 3)
     matcher.add_frame(Frame(FrameKey(1, 'other'), np.zeros((2, 4), np.uint8)))
     matcher.add_frame(frame(2))
     assert matcher.add_window(geometry(2, 1), 0.0) == []
@@ -248,7 +257,7 @@ def test_any_order_of_arrival_gives_the_same_windows(order: list[int]) -> None:
     """Frames and windows in any order: a window comes out once its frames are there, or a later
     one does; none is told of twice.
     """
-    matcher = WindowMatcher(PairedWindow, 20)
+    matcher = WindowMatcher(PairedWindow, lambda _: 20)
     decided: list[tuple[PairedWindow | Drop, float]] = []
     for event in order:
         if event < 6:
@@ -263,48 +272,117 @@ def test_any_order_of_arrival_gives_the_same_windows(order: list[int]) -> None:
 
 def test_frames_needed_follow_the_pairing() -> None:
     assert frames_needed(resolve({'pairing.intervals': (4, 10)})) == 40
-    assert frames_needed(resolve({'pairing.baselines': (1.0,), 'baseline.length': 0.3})) == 130
+    far = resolve({'pairing.baselines': (1.0,), 'baseline.length': 0.3})
+    assert frames_needed(far) == 130
+    assert frames_needed(far, MAX_BYTES // 20) == 50
 
 
-# Covariances by visual odometry
+def test_more_frames_are_kept_where_windows_reach_farther() -> None:
+    """The node that pairs was told of farther references; this one was not."""
+    matcher = WindowMatcher(PairedWindow, lambda _: 5)
+    outcomes = []
+    for stamp in range(60):
+        matcher.add_frame(frame(stamp))
+        if stamp >= 12:
+            outcomes.append(matcher.add_window(geometry(stamp, stamp - 12), 0.0))
+    assert outcomes[0] == []  # the frame is gone for good
+    assert all(stamps(o)[-1:] == [(i, i - 12)] for i, o in enumerate(outcomes[30:], start=42))
+    assert 13 <= len(matcher._frames) <= 40
+    matcher.configure(lambda _: 6)
+    matcher.add_frame(frame(99))
+    assert len(matcher._frames) == 6
 
-def aligned(covariance: np.ndarray | None, length: float = 0.3) -> AlignedWindow:
-    pose = RelativePose(rotations.exp([0.1, -0.2, 0.3]), length * np.array([0.36, 0.48, -0.8]),
-                        covariance)
-    far = RelativePose(position=np.array([0.0, 0.0, -1.0]))
-    return AlignedWindow(frame(2_000_000_000), (Reference(frame(1_000_000_000), pose),
-                                                Reference(frame(0), far)))
+
+def test_a_window_of_old_frames_does_not_fill_the_memory() -> None:
+    matcher = WindowMatcher(PairedWindow, lambda _: 2)
+    huge = np.lib.stride_tricks.as_strided(np.zeros(1, np.uint8), (2**13, 2**14), (0, 0))
+    for stamp in range(100, 160):  # 128 MB each, if they were real
+        matcher.add_frame(Frame(FrameKey(stamp, 'camera_optical'), huge))
+        matcher.add_window(geometry(stamp, 1), 0.0)
+    assert len(matcher._frames) <= 4
 
 
-def spread() -> np.ndarray:
-    root = np.random.default_rng(3).normal(size=(6, 6)) * 1e-3
+# Covariances beside the windows
+
+def aligned(*covariances: np.ndarray | None, scale: float = 1.0) -> AlignedWindow:
+    turn = rotations.exp([0.1, -0.2, 0.3])
+    return AlignedWindow(frame(2_000_000_000), tuple(
+        Reference(frame(1_000_000_000 - i), RelativePose(
+            turn, (i + 1) * scale * np.array([0.36, 0.48, -0.8]), covariance))
+        for i, covariance in enumerate(covariances)))
+
+
+def spread(seed: int = 3) -> np.ndarray:
+    root = np.random.default_rng(seed).normal(size=(6, 6)) * 1e-3
     return root @ root.T
 
 
-def test_covariance_survives_the_way_by_odometry() -> None:
+def told(window: AlignedWindow) -> list[Any]:
+    return [covariance_message(bag_messages.make, window.current.key, r.pose)
+            for r in window.references if r.pose.covariance is not None]
+
+
+def over_the_wire(window: AlignedWindow) -> AlignedWindow:
+    """The window as a nav_msgs/Path brings it: without covariances."""
+    geometry = read_window(window_message(bag_messages.make, window))
+    assert isinstance(geometry, WindowGeometry)
+    frames = {f.key: f for f in (window.current, *(r.frame for r in window.references))}
+    joined = geometry.with_frames(AlignedWindow, frames)
+    assert isinstance(joined, AlignedWindow)
+    return joined
+
+
+@pytest.mark.parametrize('scale', [1.0, 1e-6])
+def test_covariances_of_all_references_survive_the_way(scale: float) -> None:
     covariances = Covariances()
-    covariances.add(odometry_message(bag_messages.make, aligned(spread())))
-    window = covariances.attached(aligned(None))
-    np.testing.assert_allclose(window.references[0].pose.covariance, spread(), rtol=1e-9)
-    assert window.references[1].pose.covariance is None
+    window = aligned(spread(1), None, spread(2), scale=scale)
+    for message in reversed(told(window)):
+        assert covariances.add(message) is None
+    back = covariances.attached(over_the_wire(window))
+    assert isinstance(back, AlignedWindow)
+    for reference, seed in zip(back.references, (1, None, 2), strict=True):
+        if seed is None:
+            assert reference.pose.covariance is None
+        else:
+            np.testing.assert_allclose(reference.pose.covariance, spread(seed), rtol=1e-12)
+
+
+def test_a_known_covariance_stays_and_another_frames_is_not_taken() -> None:
+    covariances = Covariances()
+    for message in told(aligned(spread())):
+        covariances.add(message)
     own = covariances.attached(aligned(np.eye(6)))
     np.testing.assert_array_equal(own.references[0].pose.covariance, np.eye(6))
+    later = replace(aligned(None), current=frame(3_000_000_000))
+    assert covariances.attached(later).references[0].pose.covariance is None
+    moved = covariances.attached(aligned(None, scale=1.001))
+    assert moved.references[0].pose.covariance is None
 
 
-@pytest.mark.parametrize('told', [aligned(None), aligned(spread(), 1e-6)])
-def test_unknown_covariance_stays_unknown(told: AlignedWindow) -> None:
+def test_a_covariance_that_tells_nothing_is_named() -> None:
     covariances = Covariances()
-    covariances.add(odometry_message(bag_messages.make, told))
+    for wrong in (np.zeros(36), np.full(36, np.nan), -np.eye(6).reshape(-1)):
+        message, = told(aligned(spread()))
+        message.pose.covariance = wrong
+        drop = covariances.add(message)
+        assert isinstance(drop, Drop)
+        assert drop.cause == 'unknown_covariance'
+    message, = told(aligned(spread()))
+    message.pose.pose.position.x = np.nan
+    drop = covariances.add(message)
+    assert isinstance(drop, Drop)
+    assert drop.cause == 'not_finite'
     assert covariances.attached(aligned(None)).references[0].pose.covariance is None
 
 
 def test_covariances_are_bounded() -> None:
-    covariances = Covariances(size=2)
-    for seconds in (2, 3, 4):
-        message = odometry_message(bag_messages.make, aligned(spread()))
+    covariances = Covariances()
+    message, = told(aligned(spread()))
+    for seconds in range(2, MAX_COVARIANCES + 3):
         message.header.stamp.sec = seconds
         covariances.add(message)
     assert covariances.attached(aligned(None)).references[0].pose.covariance is None
+    assert len(covariances._known) == MAX_COVARIANCES
 
 
 # Transport

@@ -15,11 +15,10 @@ from sphstereo_ros.ros.conversions import (
     imu_sample,
     odometry_sample,
     twist_sample,
-    window_message,
 )
 from sphstereo_ros.ros.live_messages import make
 from sphstereo_ros.ros.shell import Shell, run
-from sphstereo_ros.ros.stage import pose_values
+from sphstereo_ros.ros.stage import WindowOutput, pose_values
 
 # Seconds of silence after which the other of `image` and `image/compressed` is taken.
 SILENCE = 1.0
@@ -63,7 +62,7 @@ class FramePairing:
         self._choice = TransportChoice()
         self._arrivals: dict[FrameKey, float] = {}
         self._frames = shell.output('sensor_msgs/msg/Image', 'frames')
-        self._pairs = shell.output('nav_msgs/msg/Path', 'pairs')
+        self._pairs = WindowOutput(shell, 'pairs')
         self._worker = shell.worker('frame_pairing', self._monitor, FRAMES_WAITING)
 
     def warm_up(self) -> None:
@@ -120,7 +119,7 @@ class FramePairing:
                 continue
             window = outcome
             arrival = self._arrivals.get(window.current.key, self._monitor.clock())
-            self._pairs.send(partial(window_message, make, window))
+            self._pairs.send(window)
             self._monitor.published(arrival, pose_values(window))
             if self._then is not None:
                 self._then(window, arrival)

@@ -7,10 +7,10 @@ import cv2
 
 from sphstereo_ros.core.alignment import Aligner
 from sphstereo_ros.core.frames import AlignedWindow, StabilisedWindow
-from sphstereo_ros.ros.conversions import odometry_message, window_message
+from sphstereo_ros.ros.conversions import odometry_message
 from sphstereo_ros.ros.live_messages import make
 from sphstereo_ros.ros.shell import Shell, run
-from sphstereo_ros.ros.stage import StageComponent, pose_values
+from sphstereo_ros.ros.stage import StageComponent, WindowOutput, pose_values
 from sphstereo_ros.ros.transport import SMALL_PROFILE
 
 
@@ -18,12 +18,11 @@ def build(shell: Shell, then: Callable[[AlignedWindow, float], None] | None = No
           ) -> StageComponent[StabilisedWindow, AlignedWindow]:
     """Make the component; `then` takes (window, arrival) in place of a subscriber."""
     odometry = shell.output('nav_msgs/msg/Odometry', 'odometry/visual')
-    pairs = shell.output('nav_msgs/msg/Path', 'pairs/aligned')
+    pairs = WindowOutput(shell, 'pairs/aligned')
 
     def deliver(_: StabilisedWindow, window: AlignedWindow) -> dict[str, object]:
-        # Odometry first: it carries the covariance that the window has no place for.
         odometry.send(lambda: odometry_message(make, window))
-        pairs.send(lambda: window_message(make, window))
+        pairs.send(window)
         return pose_values(window)
     return StageComponent(shell, 'motion_alignment', StabilisedWindow, 'pairs/stabilised', Aligner,
                           deliver, then)

@@ -1,9 +1,8 @@
 """All four stages in one process: windows are handed on, and cross the wire only if wanted."""
 from __future__ import annotations
 
-from sphstereo_ros.nodes import motion_alignment, pose_stabilisation
+from sphstereo_ros.nodes import motion_alignment, pose_stabilisation, spherical_stereo
 from sphstereo_ros.nodes.frame_pairing import FramePairing
-from sphstereo_ros.nodes.spherical_stereo import SphericalStereoComponent
 from sphstereo_ros.ros.shell import Component, Shell, run
 
 
@@ -23,7 +22,7 @@ def build(shell: Shell) -> list[Component]:
 
     The first link drops what is late; the others wait, so that no work is thrown away.
     """
-    stereo = SphericalStereoComponent(shell)
+    stereo = spherical_stereo.build(shell)
     aligner = motion_alignment.build(shell, stereo.hand_over)
     stabiliser = pose_stabilisation.build(shell, aligner.hand_over)
     pairing = FramePairing(shell, stabiliser.offer)

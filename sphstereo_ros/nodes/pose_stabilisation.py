@@ -7,20 +7,18 @@ import cv2
 
 from sphstereo_ros.core.frames import PairedWindow, StabilisedWindow
 from sphstereo_ros.core.stabilisation import Stabiliser
-from sphstereo_ros.ros.conversions import window_message
-from sphstereo_ros.ros.live_messages import make
 from sphstereo_ros.ros.shell import Shell, run
-from sphstereo_ros.ros.stage import StageComponent, pose_values
+from sphstereo_ros.ros.stage import StageComponent, WindowOutput, pose_values
 from sphstereo_ros.ros.transport import SMALL_PROFILE
 
 
 def build(shell: Shell, then: Callable[[StabilisedWindow, float], None] | None = None
           ) -> StageComponent[PairedWindow, StabilisedWindow]:
     """Make the component; `then` takes (window, arrival) in place of a subscriber."""
-    pairs = shell.output('nav_msgs/msg/Path', 'pairs/stabilised')
+    pairs = WindowOutput(shell, 'pairs/stabilised')
 
     def deliver(_: PairedWindow, window: StabilisedWindow) -> dict[str, object]:
-        pairs.send(lambda: window_message(make, window))
+        pairs.send(window)
         return pose_values(window)
     return StageComponent(shell, 'pose_stabilisation', PairedWindow, 'pairs', Stabiliser, deliver,
                           then)

@@ -4,14 +4,12 @@ from __future__ import annotations
 import numpy as np
 
 from sphstereo_ros.core.cloud import point_cloud
-from sphstereo_ros.core.config import Config
-from sphstereo_ros.core.frames import AlignedWindow, Drop, Image8, RangeImage
+from sphstereo_ros.core.frames import AlignedWindow, RangeImage
 from sphstereo_ros.core.preview import colour_map
 from sphstereo_ros.core.stereo import SphericalStereo
 from sphstereo_ros.ros import qos
 from sphstereo_ros.ros.conversions import cloud_message, depth_message, image_message
 from sphstereo_ros.ros.live_messages import make
-from sphstereo_ros.ros.matching import Covariances
 from sphstereo_ros.ros.shell import Shell, run
 from sphstereo_ros.ros.stage import StageComponent
 
@@ -43,39 +41,13 @@ class RangeOutputs:
         return {'metric': measured.is_metric, 'coverage': f'{known:.3f}', **measured.quality}
 
 
-class StereoWithCovariances:
-    """The core's stage on windows that came without covariances."""
-
-    def __init__(self, config: Config, mask: Image8 | None, covariances: Covariances) -> None:
-        self._stereo = SphericalStereo(config, mask)
-        self._covariances = covariances
-
-    def warm_up(self) -> None:
-        """Compile what `process` needs."""
-        self._stereo.warm_up()
-
-    def process(self, window: AlignedWindow) -> RangeImage | Drop:
-        """Range and sigma."""
-        return self._stereo.process(self._covariances.attached(window))
-
-
-class SphericalStereoComponent(StageComponent[AlignedWindow, RangeImage]):
-    """Stage 4, which takes the poses' covariances from `odometry/visual` where they come."""
-
-    def __init__(self, shell: Shell) -> None:
-        self._covariances = Covariances()
-        super().__init__(
-            shell, 'spherical_stereo', AlignedWindow, 'pairs/aligned',
-            lambda config, mask: StereoWithCovariances(config, mask, self._covariances),
-            RangeOutputs(shell).deliver, colour=shell.config.points.colour)
-
-    def subscribe(self) -> None:
-        """Take frames, windows and visual odometry from the graph."""
-        self._shell.input('nav_msgs/msg/Odometry', 'odometry/visual', self._covariances.add,
-                          self.monitor)
-        super().subscribe()
+def build(shell: Shell) -> StageComponent[AlignedWindow, RangeImage]:
+    """Make the component."""
+    return StageComponent(shell, 'spherical_stereo', AlignedWindow, 'pairs/aligned',
+                          SphericalStereo, RangeOutputs(shell).deliver,
+                          colour=shell.config.points.colour)
 
 
 def main(args: list[str] | None = None) -> int:
     """Run the node `spherical_stereo`; returns its exit status."""
-    return run('spherical_stereo', lambda shell: [SphericalStereoComponent(shell)], args)
+    return run('spherical_stereo', lambda shell: [build(shell)], args)

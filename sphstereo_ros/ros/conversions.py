@@ -93,6 +93,10 @@ def _read_pose(pose: Any) -> tuple[FloatArray, FloatArray] | Drop:
 
 # Frame windows
 
+# Covariances of messages are of position then rotation, those of the core the other way round.
+_SWAP = np.block([[np.zeros((3, 3)), np.eye(3)], [np.eye(3), np.zeros((3, 3))]])
+
+
 @dataclass(frozen=True)
 class WindowGeometry:
     """A frame window without its pixels: what a nav_msgs/Path says.
@@ -159,6 +163,36 @@ def read_window(msg: Any) -> WindowGeometry | Drop:
     return WindowGeometry(current, tuple(zip(keys[-2::-1], poses[-2::-1], strict=True)))
 
 
+def covariance_message(make: MessageFactory, current: FrameKey, pose: RelativePose) -> Any:
+    """Make the geometry_msgs/PoseWithCovarianceStamped of a reference whose covariance is known.
+
+    The pose is the one that the window's nav_msgs/Path has for this reference, in the current
+    camera's optical frame, number by number; the header is the current frame's.
+    """
+    covariance = _SWAP @ np.asarray(pose.covariance) @ _SWAP
+    return make('geometry_msgs/msg/PoseWithCovarianceStamped', header=header(make, current),
+                pose=make('geometry_msgs/msg/PoseWithCovariance',
+                          pose=_pose(make, pose.position, pose.rotation),
+                          covariance=covariance.reshape(-1)))
+
+
+def read_covariance(msg: Any) -> tuple[FrameKey, RelativePose] | Drop:
+    """Read what `covariance_message` makes: the current frame, and the reference's pose in it.
+
+    Causes: invalid_stamp, not_finite, invalid_quaternion, unknown_covariance.
+    """
+    drop = bad_stamp(msg.header)
+    if drop is not None:
+        return drop
+    pose = _read_pose(msg.pose.pose)
+    if isinstance(pose, Drop):
+        return pose
+    covariance = _covariance(msg.pose.covariance)
+    if covariance is None:
+        return Drop('unknown_covariance')
+    return frame_key(msg.header), RelativePose(pose[1], pose[0], _SWAP @ covariance @ _SWAP)
+
+
 def odometry_message(make: MessageFactory, window: FrameWindow) -> Any:
     """Make the nav_msgs/Odometry of the motion from the nearest reference to the current frame.
 
@@ -175,12 +209,11 @@ def odometry_message(make: MessageFactory, window: FrameWindow) -> Any:
     # position −R'·dp − R'·[p]·dr, rotation −R'·dr.
     jacobian = np.block([[-inverse @ rotations.skew(pose.position), -inverse],
                          [-inverse, np.zeros((3, 3))]])
-    swap = np.block([[np.zeros((3, 3)), np.eye(3)], [np.eye(3), np.zeros((3, 3))]])
     known = np.zeros((6, 6)) if pose.covariance is None else pose.covariance
     pose_covariance = jacobian @ known @ jacobian.T
     seconds = (window.current.key.stamp - reference.frame.key.stamp) / SECOND
     rate = 1 / seconds if seconds else math.nan
-    linear, twist_covariance = -pose.position * rate, swap @ known @ swap * rate**2
+    linear, twist_covariance = -pose.position * rate, _SWAP @ known @ _SWAP * rate**2
     if not pose.is_metric:
         position, linear = np.full(3, math.nan), np.full(3, math.nan)
         pose_covariance[:3], pose_covariance[:, :3] = math.nan, math.nan

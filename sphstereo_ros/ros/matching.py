@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import replace
 from threading import Lock
 from typing import Any, Generic, TypeVar
@@ -9,53 +10,78 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sphstereo_ros.core import rotations
 from sphstereo_ros.core.config import Config
-from sphstereo_ros.core.frames import AlignedWindow, Drop, Frame, FrameKey, FrameWindow
-from sphstereo_ros.core.pairing import MAX_FRAMES
-from sphstereo_ros.ros.conversions import WindowGeometry
-from sphstereo_ros.ros.messages import nanoseconds
+from sphstereo_ros.core.frames import Drop, Frame, FrameKey, FrameWindow, Reference
+from sphstereo_ros.core.pairing import MAX_BYTES, farthest_reference, frame_bytes
+from sphstereo_ros.ros.conversions import WindowGeometry, read_covariance
 
 Window = TypeVar('Window', bound=FrameWindow)
 
 MAX_PENDING = 4
 # Frames that come while a window is on its way: a second of 30 Hz, longer than a slow chain takes.
 SPARE_FRAMES = 30
+# Covariances kept, one a reference.
+MAX_COVARIANCES = 1000
 
 
-def frames_needed(config: Config) -> int:
-    """How many frames a stage keeps to have all that a window may name."""
-    pairing = config.pairing
-    by_distance = pairing.baselines != (0.0,)
-    return (MAX_FRAMES if by_distance else max(pairing.intervals)) + SPARE_FRAMES
+def frames_needed(config: Config, frame_bytes: int = 1) -> int:
+    """How many frames a stage keeps to have all that a window may name.
+
+    frame_bytes : of one frame's images, as the stage has them
+    """
+    return farthest_reference(config.pairing, frame_bytes) + SPARE_FRAMES
 
 
 class WindowMatcher(Generic[Window]):
     """Keeps the newest frames, and windows whose frames are still under way.
 
     A window that never finds its frames is a Drop `frame_missing`: when a later one is complete,
-    or when too many wait.
+    or when too many wait. Where windows reach farther back than expected (another node's
+    parameters were changed), more frames are kept from then on, up to MAX_BYTES.
+
+    needed : how many frames of so many bytes are to be kept
     """
 
-    def __init__(self, kind: type[Window], size: int) -> None:
-        self.size = size
+    def __init__(self, kind: type[Window], needed: Callable[[int], int]) -> None:
         self._kind = kind
+        self._needed = needed
+        self._grown = 0
         self._frames: OrderedDict[FrameKey, Frame] = OrderedDict()
         self._pending: list[tuple[WindowGeometry, float]] = []
+
+    def configure(self, needed: Callable[[int], int]) -> None:
+        """Keep another number of frames from the next one on."""
+        self._needed = needed
+        self._grown = 0
 
     def add_frame(self, frame: Frame) -> list[tuple[Window | Drop, float]]:
         """Take a frame; gives what it decided, each with the window's time of arrival."""
         self._frames[frame.key] = frame
         self._frames.move_to_end(frame.key)
-        while len(self._frames) > self.size:
+        size = self._size(frame)
+        while len(self._frames) > size:
             self._frames.popitem(last=False)
         return self._settle()
 
     def add_window(self, window: WindowGeometry,
                    arrival: float) -> list[tuple[Window | Drop, float]]:
         """Take a window; gives what is decided now, each with its time of arrival."""
+        self._grow_for(window)
         self._pending.append((window, arrival))
         return self._settle()
+
+    def _size(self, frame: Frame) -> int:
+        memory = frame_bytes(frame)
+        return max(self._needed(memory), min(self._grown, MAX_BYTES // max(memory, 1)))
+
+    def _grow_for(self, window: WindowGeometry) -> None:
+        """Keep twice as many where a frame that is named was thrown away already."""
+        if not self._frames:
+            return
+        oldest = next(iter(self._frames.values()))
+        full = len(self._frames) >= self._size(oldest)
+        if full and min(window.keys).stamp < oldest.key.stamp:
+            self._grown = 2 * len(self._frames)
 
     def _settle(self) -> list[tuple[Window | Drop, float]]:
         joined = [(w.with_frames(self._kind, self._frames), arrival)
@@ -68,36 +94,39 @@ class WindowMatcher(Generic[Window]):
 
 
 class Covariances:
-    """Pose covariances that came with visual odometry, for windows of the same stamp.
+    """Pose covariances, which travel beside the windows: one message a reference.
 
-    Nothing waits for them: a window without one keeps what it has.
+    They are told apart by the current frame and by the position, which is the same number by
+    number. Nothing waits for them: a reference without one keeps what it has.
     """
 
-    def __init__(self, size: int = 2 * SPARE_FRAMES) -> None:
-        self._size = size
+    def __init__(self) -> None:
         self._lock = Lock()
-        self._by_stamp: OrderedDict[int, NDArray[np.float64]] = OrderedDict()
+        self._known: OrderedDict[tuple[FrameKey, bytes], NDArray[np.float64]] = OrderedDict()
 
-    def add(self, message: Any) -> None:
-        """Take a nav_msgs/Odometry as `odometry_message` makes it; what is unknown is left out."""
-        covariance = np.array(message.pose.covariance, np.float64).reshape(6, 6)
-        if not np.isfinite(covariance).all() or not covariance.any():
-            return
+    def add(self, message: Any) -> Drop | None:
+        """Take what `covariance_message` makes; the Drop says why it is of no use."""
+        read = read_covariance(message)
+        if isinstance(read, Drop):
+            return read
+        current, pose = read
+        assert pose.covariance is not None
         with self._lock:
-            self._by_stamp[nanoseconds(message.header.stamp)] = covariance
-            while len(self._by_stamp) > self._size:
-                self._by_stamp.popitem(last=False)
+            self._known[current, pose.position.tobytes()] = pose.covariance
+            while len(self._known) > MAX_COVARIANCES:
+                self._known.popitem(last=False)
+        return None
 
-    def attached(self, window: AlignedWindow) -> AlignedWindow:
-        """The window with the covariance of its nearest reference, where that is there."""
-        nearest, *others = window.references
+    def attached(self, window: Window) -> Window:
+        """The window with the covariances that are there."""
         with self._lock:
-            told = self._by_stamp.get(window.current.key.stamp)
-        if told is None or nearest.pose.covariance is not None:
-            return window
-        # The message tells of the inverse pose, position first: undo both.
-        pose = nearest.pose
-        back = np.block([[np.zeros((3, 3)), -pose.rotation],
-                         [-pose.rotation, rotations.skew(pose.position) @ pose.rotation]])
-        known = replace(pose, covariance=back @ told @ back.T)
-        return AlignedWindow(window.current, (replace(nearest, pose=known), *others))
+            references = tuple(self._with_covariance(window.current.key, reference)
+                               for reference in window.references)
+        return replace(window, references=references)
+
+    def _with_covariance(self, current: FrameKey, reference: Reference) -> Reference:
+        pose = reference.pose
+        told = self._known.get((current, pose.position.tobytes()))
+        if told is None or pose.covariance is not None:
+            return reference
+        return replace(reference, pose=replace(pose, covariance=told))

@@ -15,6 +15,8 @@ IMAGE_INPUT = _profile(ReliabilityPolicy.BEST_EFFORT, 5)
 SENSOR_INPUT = _profile(ReliabilityPolicy.BEST_EFFORT, 100)
 
 RESULT = _profile(ReliabilityPolicy.RELIABLE, 5)
+# Small messages of which several make one result.
+PARTS = _profile(ReliabilityPolicy.RELIABLE, 50)
 # fastdds.xml is sized for this depth.
 LARGE_RESULT = _profile(ReliabilityPolicy.RELIABLE, 3)
 

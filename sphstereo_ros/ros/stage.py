@@ -10,14 +10,45 @@ import numpy as np
 from sphstereo_ros.core import rotations
 from sphstereo_ros.core.config import Config
 from sphstereo_ros.core.frames import Drop, FrameWindow, Image8
-from sphstereo_ros.ros.conversions import decode_frame, read_window
-from sphstereo_ros.ros.matching import WindowMatcher, frames_needed
+from sphstereo_ros.ros import qos
+from sphstereo_ros.ros.conversions import (
+    covariance_message,
+    decode_frame,
+    read_window,
+    window_message,
+)
+from sphstereo_ros.ros.live_messages import make
+from sphstereo_ros.ros.matching import Covariances, WindowMatcher, frames_needed
 from sphstereo_ros.ros.shell import Shell
 
 In = TypeVar('In', bound=FrameWindow)
 Taken = TypeVar('Taken', bound=FrameWindow, contravariant=True)
 Out = TypeVar('Out', covariant=True)
 Made = TypeVar('Made')
+
+
+COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
+
+
+def covariance_topic(pairs: str) -> str:
+    """Where the covariances of the windows on the topic `pairs` travel."""
+    return f'{pairs}/covariance'
+
+
+class WindowOutput:
+    """Publishes windows on a topic, and the covariances of their poses beside it."""
+
+    def __init__(self, shell: Shell, topic: str) -> None:
+        self._covariances = shell.output(COVARIANCE, covariance_topic(topic), qos.PARTS)
+        self._windows = shell.output('nav_msgs/msg/Path', topic)
+
+    def send(self, window: FrameWindow) -> None:
+        """Publish what somebody subscribes to; covariances first, for nothing waits for them."""
+        for reference in window.references:
+            if reference.pose.covariance is not None:
+                self._covariances.send(partial(covariance_message, make, window.current.key,
+                                               reference.pose))
+        self._windows.send(partial(window_message, make, window))
 
 
 class Stage(Protocol[Taken, Out]):
@@ -56,7 +87,8 @@ class StageComponent(Generic[In, Made]):
         self._deliver = deliver
         self._then = then
         self._stage = make_stage(shell.config, shell.mask)
-        self._matcher = WindowMatcher(kind, frames_needed(shell.config))
+        self._matcher = WindowMatcher(kind, partial(frames_needed, shell.config))
+        self._covariances = Covariances()
         self._worker = shell.worker(name, self.monitor)
 
     def warm_up(self) -> None:
@@ -66,11 +98,14 @@ class StageComponent(Generic[In, Made]):
     def subscribe(self) -> None:
         """Take frames and windows from the graph."""
         self._shell.input('sensor_msgs/msg/Image', 'frames', self._take_frame, self.monitor)
+        # Before the windows: of messages that wait, they are taken first.
+        self._shell.input(COVARIANCE, covariance_topic(self._topic), self._take_covariance,
+                          self.monitor, qos.PARTS)
         self._shell.input('nav_msgs/msg/Path', self._topic, self._take_window, self.monitor)
 
     def configure(self, config: Config) -> None:
         """Make the stage anew with `config`, once the running window is done."""
-        self._matcher.size = frames_needed(config)
+        self._matcher.configure(partial(frames_needed, config))
 
         def exchange() -> None:
             stage = self._make_stage(config, self._shell.mask)
@@ -95,6 +130,11 @@ class StageComponent(Generic[In, Made]):
         else:
             self._settle(self._matcher.add_frame(frame))
 
+    def _take_covariance(self, message: Any) -> None:
+        drop = self._covariances.add(message)
+        if drop is not None:
+            self.monitor.dropped(Drop(f'covariance_{drop.cause}', drop.detail))
+
     def _take_window(self, message: Any) -> None:
         arrival = self.monitor.arrived()
         window = read_window(message)
@@ -111,7 +151,7 @@ class StageComponent(Generic[In, Made]):
                 self._worker.put_newest(partial(self._process, window, arrival))
 
     def _process(self, window: In, arrival: float) -> None:
-        result = self._stage.process(window)
+        result = self._stage.process(self._covariances.attached(window))
         if isinstance(result, Drop):
             self.monitor.dropped(result)
             return
