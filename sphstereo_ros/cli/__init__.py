@@ -20,6 +20,7 @@ COMMANDS = {
     'run': ('sphstereo_ros.cli.run', 'depth and clouds from a bag, a video or frames, offline'),
     'replay': ('sphstereo_ros.cli.replay', 'publish the inputs in a bag live, with /clock'),
     'import': ('sphstereo_ros.cli.import_video', 'any 360° video into a bag'),
+    'mask': ('sphstereo_ros.cli.mask', "the vehicle's mask (camera.mask) from a recording"),
     'scene': ('sphstereo_ros.scenes.command', 'render scenes with exact range and pose'),
     'bench': ('sphstereo_ros.bench.command', 'measure accuracy, speed, and the live nodes'),
 }
