@@ -38,6 +38,7 @@ _MARGIN, _WRAP = 8, 8
 _POLE = 0.1  # rad round both poles, where the grid is too stretched to track
 # A farther reference sees a point at another distance and from another side; still to be followed.
 _STRETCH, _FARTHEST = 1.4, 0.45
+_LEVELS = 1
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def followed(view: CurrentView, reference: Image8, pose: RelativePose,
         image = reference_in_relief(reference, pose, view.grid, view.axes, relief)
         chosen = np.nonzero(_alike(_seen(view.bearings, relief, view.points, pose),
                                    view.bearings))[0]
-        moved, found = follow_both_ways(view.image, image, view.points[chosen])
+        moved, found = follow_both_ways(view.image, image, view.points[chosen], levels=_LEVELS)
         moved, chosen = moved[found], chosen[found]
         seen = _seen(view.bearings_of(moved), relief, moved, pose)
         seen /= np.linalg.norm(seen, axis=1, keepdims=True)

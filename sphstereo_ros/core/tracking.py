@@ -78,14 +78,14 @@ def follow(source: Image8, target: Image8, points: Points, *,
     return moved, found
 
 
-def follow_both_ways(source: Image8, target: Image8,
-                     points: Points) -> tuple[Points, NDArray[np.bool_]]:
+def follow_both_ways(source: Image8, target: Image8, points: Points, *,
+                     levels: int = 3) -> tuple[Points, NDArray[np.bool_]]:
     """Like `follow`, but found are only those that look alike in both images and are found back.
 
     At the edge of something near, a part of the window moves with what is behind: such a point is
     followed to a wrong place, from which it is not found back.
     """
-    moved, found, unlike = _lucas_kanade(source, target, points, None, 3)
+    moved, found, unlike = _lucas_kanade(source, target, points, None, levels)
     back, _, _ = _lucas_kanade(target, source, moved, points, 0)
     found &= np.linalg.norm(back - points, axis=1) < _FOUND_BACK
     if found.any():
