@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from analytic_world import View, World, look, true_pose
-from two_views import angle_between
+from two_views import angle_between, matches, random_rotation, two_views
 
 from sphstereo_ros.core import rotations
+from sphstereo_ros.core.aligned_view import CurrentView, length_by_ranges, nearness
 from sphstereo_ros.core.alignment import Aligner
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import (
@@ -179,6 +180,70 @@ def test_no_refinement_leaves_far_poses_as_predicted() -> None:
     stabilised = stages.stabiliser.process(paired(11, 1, 4, 10))
     out = stages.aligner.process(stabilised)
     assert len(out.references) == 3
+
+
+# --- lengths that are assumed
+
+
+def speeding(order: tuple[int, ...], source: str) -> AlignedWindow:
+    """The last window of a drive that has these views, each step taken as 0.2 m."""
+    stages = Stages(baseline__source=source)
+    for n in range(1, len(order)):
+        references = tuple(
+            Reference(frame(order[n - back]),
+                      RelativePose(np.eye(3), np.array([0, 0, -STEP * back])))
+            for back in (1, 4) if back <= n)
+        out = stages.process(PairedWindow(frame(order[n]), references))
+    assert isinstance(out, AlignedWindow)
+    return out
+
+
+@pytest.mark.parametrize('order', [(0, 3, 6, 8, 9, 10), (0, 1, 2, 3, 5, 8)],
+                         ids=['braking', 'accelerating'])
+def test_a_changing_speed_shows_in_the_far_length(order: tuple[int, ...]) -> None:
+    """The last step is what was assumed; ranges by it tell how far the far reference is."""
+    out = speeding(order, 'fixed')
+    near, far = (r.pose for r in out.references)
+    true_near, true_far = (true_pose(views()[r.frame.key.stamp - 1000], views()[order[-1]])
+                           for r in out.references)
+    assert near.baseline == pytest.approx(STEP)
+    assert far.baseline / STEP == pytest.approx(true_far.baseline / true_near.baseline, rel=0.01)
+    assert abs(true_far.baseline / true_near.baseline - 4) > 0.5
+    assert within(errors(out, order[-1] - out.references[1].frame.key.stamp + 1000), 0.02, 0.05)
+
+
+def test_a_measured_length_stays() -> None:
+    out = speeding((0, 3, 6, 8, 9, 10), 'odometry')
+    assert [r.pose.baseline for r in out.references] == pytest.approx([STEP, 4 * STEP])
+
+
+def test_length_by_exact_ranges() -> None:
+    rng = np.random.default_rng(7)
+    turn, position = random_rotation(rng, 0.3), np.array([0.5, -0.2, -2.0])
+    reference, current = two_views(rng, (300,), turn, position, near=3.0)
+    points, index = matches(reference, current), rng.permutation(400)[:300]
+    known = np.full(400, np.nan)
+    ranges = nearness(points, RelativePose(turn, position))
+    known[index] = ranges
+    known[index[:40]] *= 1.5  # wrong
+    grid = PolarGrid(100)
+    view = CurrentView(grid, np.eye(3), np.zeros(grid.shape, np.uint8), np.zeros((400, 2)),
+                       np.zeros(400), np.zeros((400, 3)), known, 0.3)
+    length, sigma = length_by_ranges(view, points, index, RelativePose(turn, 9 * position))
+    assert length == pytest.approx(np.linalg.norm(position), rel=1e-9)
+    assert sigma < 0.01 * length
+    few = replace(view, baseline=0.01)  # with hardly any parallax nothing is told
+    assert length_by_ranges(few, points, index, RelativePose(turn, position)) is None
+
+
+def test_nearness_is_the_inverse_range() -> None:
+    rng = np.random.default_rng(8)
+    turn, position = random_rotation(rng, 0.3), np.array([0.5, -0.2, -2.0])
+    points = rng.normal(size=(50, 3)) * 6
+    reference = (points - position) @ turn
+    seen = matches(*(p / np.linalg.norm(p, axis=1, keepdims=True) for p in (reference, points)))
+    np.testing.assert_allclose(nearness(seen, RelativePose(turn, position)),
+                               1 / np.linalg.norm(points, axis=1), rtol=1e-9)
 
 
 # --- resampling by range

@@ -5,12 +5,13 @@ the meridians is the error of rotation and direction, and it is solved for over 
 """
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import relative_pose
+from .aligned_view import CurrentView, current_view, followed, length_by_ranges
 from .camera import Equirectangular
 from .config import AlignmentConfig, Config
 from .frames import (
@@ -26,104 +27,16 @@ from .frames import (
 from .history import PoseHistory, with_baseline
 from .paper import window_ratio_direction
 from .relative_pose import Correspondences, PoseEstimate, epipolar_residuals, refine
-from .relief import nearness_map, reference_in_relief, sampled
-from .sphere import polar_axes, polar_bearings
 from .stabilisation import reduced, with_length
-from .tracking import Points, features, follow_both_ways, spacing_for
-from .warp import Map, PolarGrid, polar_map, resample, with_border
+from .warp import PolarGrid
 
 Floats = NDArray[np.float64]
 
 _MARGIN, _WRAP = 8, 8
-_POLE = 0.1  # rad round both poles, where the grid is too stretched to track
-# A farther reference sees a point at another distance and from another side; still to be followed.
-_STRETCH, _FARTHEST = 1.4, 0.45
-_LEVELS = 1
-
-
-@dataclass(frozen=True)
-class CurrentView:
-    """The current frame on the polar grid about one direction of motion, and its features.
-
-    axes : (3, 3) of the grid; image : (rows, columns) uint8; points : (N, 2) float32 pixels;
-    sigma : (N,) px, expected error of following each; bearings : (N, 3), current optical frame;
-    nearness : (N,) 1/m, the inverse range of each, as far as it is known (else NaN)
-    """
-
-    grid: PolarGrid
-    axes: Floats
-    image: Image8
-    points: Points
-    sigma: Floats
-    bearings: Floats
-    nearness: Floats
-
-    def bearings_of(self, pixels: Points) -> Floats:
-        """Pixels (N, 2) of the grid → bearings (N, 3) along the current camera's axes."""
-        offset = np.array([self.grid.margin, self.grid.wrap]) - 0.5
-        theta, azimuth = ((pixels - offset) * self.grid.pixel).T
-        return polar_bearings(theta, azimuth, self.axes)
-
-
-def current_view(current: Image8, direction: Floats, grid: PolarGrid, count: int) -> CurrentView:
-    """Resample the current frame about `direction` and choose its features, at most about `count`.
-    """
-    axes = polar_axes(direction)
-    image = resample(with_border(current), polar_map(grid, axes, current.shape))
-    inside = np.zeros(grid.shape, bool)
-    inside[grid.wrap:-grid.wrap, np.sin(grid.theta()) > np.sin(_POLE)] = True
-    points, sigma = features(image, spacing_for(count, grid.height), inside)
-    view = CurrentView(grid, axes, image, points, sigma, np.zeros((0, 3)),
-                       np.full(len(points), np.nan))
-    return replace(view, bearings=view.bearings_of(points))
-
-
-def followed(view: CurrentView, reference: Image8, pose: RelativePose,
-             ) -> tuple[Correspondences, NDArray[np.intp]]:
-    """Features of `view` found in the reference image, and which they are.
-
-    The reference is resampled as if all were at infinity or, where `view` knows ranges, by them:
-    then what would look too different from there is left out.
-    """
-    if not np.isfinite(view.nearness).any():
-        image = resample(with_border(reference), polar_map(
-            view.grid, pose.rotation.T @ view.axes, reference.shape))
-        moved, found = follow_both_ways(view.image, image, view.points)
-        chosen = np.nonzero(found)[0]
-        seen = view.bearings_of(moved[found])
-    else:
-        relief = nearness_map(view.grid, view.points, view.nearness)
-        image = reference_in_relief(reference, pose, view.grid, view.axes, relief)
-        chosen = np.nonzero(_alike(_seen(view.bearings, relief, view.points, pose),
-                                   view.bearings))[0]
-        moved, found = follow_both_ways(view.image, image, view.points[chosen], levels=_LEVELS)
-        moved, chosen = moved[found], chosen[found]
-        seen = _seen(view.bearings_of(moved), relief, moved, pose)
-        seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    return Correspondences(seen @ pose.rotation, view.bearings[chosen],
-                           view.sigma[chosen] * view.grid.pixel), chosen
-
-
-def _seen(bearings: Floats, relief: Map, pixels: Points, pose: RelativePose) -> Floats:
-    """Where the reference camera sees what the relief has at `pixels`: vectors (N, 3), current
-    axes, in units of the range from the current camera.
-    """
-    return np.asarray(bearings - sampled(relief, pixels)[:, None] * pose.position)
-
-
-def _alike(seen: Floats, bearings: Floats) -> NDArray[np.bool_]:
-    """Which points (N,) both cameras see from about the same side and distance."""
-    length = np.linalg.norm(seen, axis=1)
-    turned = np.einsum('na,na->n', seen, bearings) / length
-    return np.asarray((np.abs(np.log(length)) < np.log(_STRETCH)) & (turned > np.cos(_FARTHEST)))
-
-
-def nearness(points: Correspondences, pose: RelativePose) -> Floats:
-    """Inverse range (N,) of each point from the current camera, 1/m; negative behind it."""
-    seen = points.reference @ pose.rotation.T
-    lever = np.cross(seen, pose.position)
-    return np.asarray(np.einsum('na,na->n', np.cross(seen, points.current), lever)
-                      / np.maximum(np.einsum('na,na->n', lever, lever), 1e-300))
+# By how much a length may differ from the one believed before the reference is followed anew, and
+# how uncertain it may be, as a share of it.
+_SURPRISE, _UNSURE = 0.03, 0.01
+_LIKELY = 0.3  # least length of a chain, as a share of what is believed
 
 
 class Aligner:
@@ -133,6 +46,8 @@ class Aligner:
         self.config: AlignmentConfig = config.alignment
         self._mask = mask
         self._history = PoseHistory()
+        # Where no sensor measures them, all steps between frames are taken as equally long.
+        self._assumes_steps = config.baseline.source in ('fixed', 'speed')
 
     def warm_up(self) -> None:
         """Compile what `process` needs."""
@@ -197,34 +112,56 @@ class Aligner:
         for iteration in range(self.config.iterations):
             if iteration:
                 view = current_view(current, pose.direction, grid, self.config.max_points)
-            found = self._step(view, reference, pose)
+            found = self._fitted(view, reference, pose)
             if isinstance(found, Drop):
                 return found
-            view, pose = found
+            points, index, estimate = found
+            pose = with_length(estimate, reference.pose)
+            view = view.taught(points, index, pose)
         return view, pose
 
     def _farther(self, view: CurrentView, current: FrameKey,
                  reference: Reference) -> tuple[CurrentView, RelativePose] | Drop:
-        """Refine from the end of a chain, with the features of the nearest reference's view."""
-        pose = reference.pose
-        chained = self._history.between(reference.frame.key, current)
-        if chained is not None and chained.baseline > 0.5 * pose.baseline:
-            pose = with_baseline(chained, pose.baseline)
-        return self._step(view, reference, pose) if self.config.iterations else (view, pose)
+        """Refine from the end of a chain, with the features of the nearest reference's view.
 
-    def _step(self, view: CurrentView, reference: Reference,
-              pose: RelativePose) -> tuple[CurrentView, RelativePose] | Drop:
-        """One refinement, and the view with the ranges that it told."""
+        An assumed length gives way to the one that ranges by nearer references tell.
+        """
+        pose = self._predicted(current, reference)
+        for _ in range(2 if self.config.iterations else 0):
+            found = self._fitted(view, reference, pose)
+            if isinstance(found, Drop):
+                return found
+            points, index, estimate = found
+            refined = with_length(estimate, reference.pose)
+            told = length_by_ranges(view, points, index, refined) if self._assumes_steps else None
+            if told is None:
+                return view.taught(points, index, refined), refined
+            length, sigma = told
+            refined = with_baseline(refined, length)
+            if abs(length - pose.baseline) < _SURPRISE * length and sigma < _UNSURE * length:
+                return view.taught(points, index, refined), refined
+            pose = refined
+        return Drop('alignment_failed', 'ranges tell no length') if self.config.iterations \
+            else (view, pose)
+
+    def _predicted(self, current: FrameKey, reference: Reference) -> RelativePose:
+        """Where the poses of earlier windows put the reference, or else stage 2."""
+        chained = self._history.between(reference.frame.key, current)
+        believed = reference.pose.baseline
+        if chained is None or not _LIKELY < chained.baseline / believed < 1 / _LIKELY:
+            return reference.pose
+        return chained if self._assumes_steps else with_baseline(chained, believed)
+
+    def _fitted(self, view: CurrentView, reference: Reference, pose: RelativePose,
+                ) -> tuple[Correspondences, NDArray[np.intp], PoseEstimate] | Drop:
+        """One refinement: its inliers, which features these are, and the estimate."""
         points, index = followed(view, self._reduced(reference.frame.image), pose)
         keep = self._beside_mask(points)
         points, index = points[keep], index[keep]
-        refined = self._refined(points, pose, view.grid.pixel)
-        if isinstance(refined, Drop):
-            return refined
-        pose = with_length(refined, reference.pose)
-        known = view.nearness.copy()
-        known[index[refined.inliers]] = nearness(points[refined.inliers], pose)
-        return replace(view, nearness=known), pose
+        estimate = self._refined(points, pose, view.grid.pixel)
+        if isinstance(estimate, Drop):
+            return estimate
+        return points[estimate.inliers], index[estimate.inliers], estimate
 
     def _beside_mask(self, points: Correspondences) -> NDArray[np.bool_]:
         """Which neither view sees on the vehicle, (N,)."""

@@ -14,7 +14,7 @@ NODE_PARAMETERS: dict[str, tuple[str, ...]] = {
     'frame_pairing': ('camera.model', 'camera.mount.', 'baseline.', 'pairing.',
                       'stereo.working_height', 'points.colour'),
     'pose_stabilisation': ('pose.', 'camera.mask', 'pairing.', 'baseline.source'),
-    'motion_alignment': ('alignment.', 'camera.mask', 'pairing.'),
+    'motion_alignment': ('alignment.', 'camera.mask', 'pairing.', 'baseline.source'),
     'spherical_stereo': ('stereo.', 'range.', 'points.', 'camera.', 'baseline.relative_sigma',
                          'pairing.'),
     'pipeline': ('camera.', 'baseline.', 'pairing.', 'pose.', 'alignment.', 'stereo.', 'range.',
