@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 import room
@@ -232,6 +233,24 @@ def test_tables_tell_all_methods(summaries) -> None:
     assert [line.split()[1] for line in text.splitlines()[4:8]] == list(summaries)
     assert '2 (2 too_few_points)' in text
     assert tables({'none': {'frames': 0}}) == 'no frame was scored'
+
+
+def test_plots_are_written(summaries, tmp_path) -> None:
+    pytest.importorskip('matplotlib')
+    from sphstereo_ros.bench.plots import coverage_by_angle, error_by_range, write_plots
+    paths = write_plots(summaries, tmp_path / 'new')
+    assert [path.name for path in paths] == ['error_by_range.png', 'coverage_by_angle.png',
+                                             'sigma_calibration.png']
+    for path in paths:
+        height, width = cv2.imread(str(path)).shape[:2]
+        assert width > height > 300
+    error, coverage = error_by_range(summaries).axes
+    names = [line.get_label() for line in error.get_lines()]
+    assert names == list(summaries)
+    drawn = coverage.get_lines()[names.index('one')].get_ydata()
+    told = [g['coverage'] for g in summaries['one']['by_range'].values() if g['share'] > 0.05]
+    np.testing.assert_allclose(drawn[np.isfinite(drawn)], told)
+    assert len(coverage_by_angle(summaries).axes[0].get_lines()) == 2 * len(summaries)
 
 
 def test_short_sequences_are_scored_from_the_middle() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,8 @@ def _add_accuracy(parser: argparse.ArgumentParser) -> None:
                         '(default: 10; half of a shorter sequence)')
     parser.add_argument('--cache', type=Path, metavar='DIR', help='keep what is rendered here, '
                         'and take it from here the next time')
+    parser.add_argument('--plots', type=Path, metavar='DIR', help='write plots as PNG (extra '
+                        "'plots')")
     parser.add_argument('--methods', default=','.join(COMPARED),
                         help=f'of {",".join(METHODS)} (default: %(default)s)')
     parser.add_argument('--params', type=Path, action='append', default=[], metavar='FILE',
@@ -83,6 +86,7 @@ def _accuracy(args: argparse.Namespace) -> dict[str, Any]:
     unknown = sorted(set(names) - set(METHODS))
     if unknown:
         raise BadInput(f'--methods: {unknown[0]} is none of {", ".join(METHODS)}')
+    write = _plotter() if args.plots is not None else None
     given = load_values(args.params, args.overrides)
     contest = Contest({name: method(name, given) for name in names})
     scenes = Scenes(args.scene, args.seeds, args.frames, args.height, args.nuisance, args.cache)
@@ -91,7 +95,18 @@ def _accuracy(args: argparse.Namespace) -> dict[str, Any]:
             contest.add(sequence, frames_to_skip(len(sequence), args.skip), progress.update)
     summaries = contest.summaries()
     print(tables(summaries))
+    if write is not None:
+        print('\nwritten:', ', '.join(map(str, write(summaries, args.plots))))
     return summaries
+
+
+def _plotter() -> Callable[[dict[str, Any], Path], list[Path]]:
+    """Known to be there before hours of measuring."""
+    try:
+        from .plots import write_plots
+    except ImportError as error:
+        raise BadInput(f"--plots needs the extra 'plots': {error}") from error
+    return write_plots
 
 
 def _speed(args: argparse.Namespace) -> dict[str, Any]:
