@@ -166,9 +166,14 @@ class AlignmentConfig:
 class StereoConfig:
     """Matching along the meridians (stage 4)."""
 
-    matcher: str = _p('stereo.matcher', 'hybrid', 'flow, flow_fast: dense flow with checks; '
+    matcher: str = _p('stereo.matcher', 'joint', 'joint: all references together, checked by a '
+                      'second method and by the frames before; joint_fast: the same from bm, '
+                      'checked by itself; pair by pair: flow, flow_fast: dense flow with checks; '
                       'bm, sgbm: as in OpenCV; hybrid: flow averaged with bm',
-                      choices=('hybrid', 'flow', 'flow_fast', 'bm', 'sgbm'))
+                      choices=('joint', 'joint_fast', 'hybrid', 'flow', 'flow_fast', 'bm', 'sgbm'))
+    memory: float = _p('stereo.memory', 0.45, 'joint matchers: how long a range is kept that no '
+                       'newer frame confirms; 0 = every frame by itself', unit='s', low=0.0,
+                       high=0.5)
     num_disparities: int = _p('stereo.num_disparities', 96, 'search range of bm, sgbm and hybrid',
                               unit='px', low=16, high=1024)
     block_size: int = _p('stereo.block_size', 15, 'odd window of bm, sgbm and hybrid',

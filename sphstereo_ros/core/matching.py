@@ -214,13 +214,13 @@ def semi_global_matcher(disparities: int, block: int) -> Matcher:
 
 
 def matcher(config: StereoConfig) -> Matcher:
-    """The matcher that `config` names."""
+    """The matcher that `config` names; of a joint one, that of the nearest pair."""
     block = block_matcher(config.num_disparities, config.block_size)
-    if config.matcher == 'bm':
+    if config.matcher in ('bm', 'joint_fast'):
         return block
     if config.matcher == 'sgbm':
         return semi_global_matcher(config.num_disparities, min(config.block_size, 7))
     if config.matcher == 'flow_fast':
         return flow_matcher('ultrafast', 2, 20.0, _BOUNDS['flow_fast'])
     flow = flow_matcher('fast', 1, 40.0, _BOUNDS['flow'])
-    return hybrid_matcher(flow, block) if config.matcher == 'hybrid' else flow
+    return flow if config.matcher == 'flow' else hybrid_matcher(flow, block)

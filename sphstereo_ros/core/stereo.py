@@ -16,7 +16,9 @@ from .frames import (
     RelativePose,
 )
 from .inverse_range import InverseRange, fuse, inverse_range, published_range
+from .joint import JointMatcher
 from .matching import MARGIN, matcher
+from .range_memory import RangeMemory
 from .warp import PolarGrid, aligned_pair
 
 
@@ -26,11 +28,19 @@ def stereo_grid(height: int) -> PolarGrid:
 
 
 class SphericalStereo:
-    """Matches each pair of a window along its meridians and fuses the ranges."""
+    """Range of the current frame from all references of a window, and from the windows before.
+
+    The joint matchers measure with all references together and remember; the others match pair
+    by pair.
+    """
 
     def __init__(self, config: Config, mask: Image8 | None = None) -> None:
         self.config = config
         self._match = matcher(config.stereo)
+        self._joint: JointMatcher | None = None
+        if config.stereo.matcher in ('joint', 'joint_fast'):
+            self._joint = JointMatcher(config.stereo.matcher, self._match)
+        self._memory = RangeMemory(config.stereo.memory)
         self._mask = mask
 
     def warm_up(self) -> None:
@@ -39,6 +49,7 @@ class SphericalStereo:
         frames = [Frame(FrameKey(stamp, ''), noise) for stamp in range(2)]
         pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -1.0]), 1e-9 * np.eye(6))
         self.process(AlignedWindow(frames[1], (Reference(frames[0], pose),)))
+        self._memory = RangeMemory(self.config.stereo.memory)
 
     def process(self, window: AlignedWindow) -> RangeImage | Drop:
         """Range and sigma on the current frame's grid.
@@ -51,10 +62,20 @@ class SphericalStereo:
             return Drop('size_changed', 'the frames of a window differ in size')
         if len({r.pose.is_metric for r in window.references}) != 1:
             return Drop('mixed_scale', 'some baselines of a window are metric, others are not')
-        estimate = fuse([self._measure(window.current, r) for r in window.references])
-        r, sigma = published_range(estimate, self.config.range, window.is_metric,
-                                   self._mask_of(height))
+        mask = self._mask_of(height)
+        if self._joint is not None:
+            estimate = self._remembered(self._joint, window, mask)
+        else:
+            estimate = fuse([self._measure(window.current, r) for r in window.references])
+        r, sigma = published_range(estimate, self.config.range, window.is_metric, mask)
         return RangeImage(window.current.key, r, sigma, window.is_metric)
+
+    def _remembered(self, joint: JointMatcher, window: AlignedWindow,
+                    mask: Image8 | None) -> InverseRange:
+        measured = joint.measure(window.current, window.references)
+        fused = self._memory.fused(window.current.key, window.references, measured,
+                                   None if mask is None else mask != 0)
+        return InverseRange(fused.rho, fused.sigma, signed=True)
 
     def _measure(self, current: Frame, reference: Reference) -> InverseRange:
         height = current.image.shape[0]

@@ -1,0 +1,226 @@
+"""Joint matching: one measurement of inverse range from all references of a window.
+
+    nearest pair matched → refined on all references → compared with a second opinion
+
+The nearest pair decides what is near: its parallaxes are small, so nothing is missed by a search
+that ends. The farther references then sharpen what it found. The second opinion, a sweep over the
+sphere, errs in other places than a dense flow does; only what both find is measured.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .frames import UNSCALED, Frame, Image8, Reference, RelativePose
+from .inverse_range import NOTHING, _grid_angles, _polar_row, pose_sigmas
+from .jit import kernel, rows_in_parallel
+from .matching import MARGIN, UNKNOWN, Matcher
+from .refinement import REACH, JointRefinement, Refined
+from .sphere import polar_axes
+from .sweep import sweep
+from .warp import Map, PolarGrid, polar_map, resample, with_border
+
+Floats = NDArray[np.float64]
+
+# References of the sweep reach that many times as far as the nearest: beyond, its levels would
+# change faster than one a pixel on a road.
+_SWEPT = 5.0
+_AGREES, _LEVELS = 0.05, 0.75  # of the inverse range, or so many pixels at half size
+_SLACK = 1.5  # px of the nearest pair by which refinement may move what was matched
+# The error model, fitted to the tuning scenes: differences in grey within a window are not
+# independent, and no match is better than a share of a pixel.
+_DEPENDENT, _FLOOR = 3.0, 0.1
+_WINDOWS = {'joint': (9, 9), 'joint_fast': (9,)}
+_CELL, _SPREADS = 8, (1.0, 6.0)  # px, cells: how what was not matched is filled for a start
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Inverse range on the current frame's grid, float32 (H, 2H), 1/m (1/step if not metric).
+
+    rho, sigma : where `agreed`; sigma is what it would be elsewhere too
+    other : the second opinion by itself
+    agreed : uint8, 1 where the second opinion is the same
+    """
+
+    rho: Map
+    sigma: Map
+    other: Map
+    agreed: Image8
+
+
+def in_steps(pose: RelativePose) -> RelativePose:
+    """The pose with positions in metres, or in steps between frames where metres are unknown."""
+    if pose.is_metric:
+        return pose
+    covariance = None
+    if pose.covariance is not None:
+        stretch = np.diag([1.0, 1.0, 1.0, *[1 / UNSCALED] * 3])
+        covariance = stretch @ pose.covariance @ stretch
+    return RelativePose(pose.rotation, pose.position / UNSCALED, covariance)
+
+
+@kernel
+def _nearness_rows(first: int, last: int, pixels: Map, theta: Map, pixel: np.float32,
+                   baseline: np.float32, rho: Map) -> None:  # pragma: no cover - compiled
+    """ρ = sin δ / (b sin θ1), or UNKNOWN."""
+    for i in range(first, last):
+        for j in range(theta.size):
+            delta = pixels[i, j] * pixel
+            before = np.sin(theta[j] - delta)
+            known = pixels[i, j] != UNKNOWN and before > 1e-3 and abs(delta) < 1
+            rho[i, j] = np.sin(delta) / (baseline * before) if known else np.float32(UNKNOWN)
+
+
+def filled(rho: Map) -> Map:
+    """`rho` with what is UNKNOWN taken smoothly from round about (0 where nothing is known)."""
+    known = (rho != UNKNOWN).astype(np.float32)
+    rows, columns = (-(-n // _CELL) for n in rho.shape)
+    sums = [cv2.resize(m, (columns, rows), interpolation=cv2.INTER_AREA)
+            for m in (np.where(known > 0, rho, np.float32(0)), known)]
+    total, count = np.zeros((2, rows, columns), np.float32)
+    for spread, weight in zip(_SPREADS, (1.0, 0.01), strict=True):
+        total += weight * cv2.GaussianBlur(sums[0], (0, 0), spread)
+        count += weight * cv2.GaussianBlur(sums[1], (0, 0), spread)
+    smooth = cv2.resize(total / np.maximum(count, 1e-6), rho.shape[::-1])
+    return np.where(known > 0, rho, smooth).astype(np.float32)
+
+
+@kernel
+def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map, sin_lon: Map,
+                  axes: Map, at_pole: Map, rho: Map, information: Map, other: Map,
+                  baselines: Map, pose: Map, tolerance: Map, out: Map, sigma_out: Map,
+                  other_out: Map, agreed: Image8) -> None:  # pragma: no cover - compiled
+    """Sample the polar grid; σ and agreement of every pixel.
+
+    at_pole : column of the pole, row of the azimuth 0, rad of a pixel; pose : (references, 3)
+    standard deviations of rotation, direction, baseline; tolerance : see `_tolerance`
+    """
+    at = np.empty((4, cos_lon.size), np.float32)
+    half, nothing = np.float32(0.5), np.float32(NOTHING)
+    for i in range(first, last):
+        _polar_row(cos_lat[i], sin_lat[i], cos_lon, sin_lon, axes, at_pole[0], at_pole[1],
+                   np.float32(1) / at_pole[2], at)
+        for j in range(cos_lon.size):
+            c, r = np.int32(at[2, j]), np.int32(at[3, j])
+            fc, fr = at[2, j] - np.float32(c), at[3, j] - np.float32(r)
+            a, b, d, e = rho[r, c], rho[r, c + 1], rho[r + 1, c], rho[r + 1, c + 1]
+            cn, rn = np.int32(at[2, j] + half), np.int32(at[3, j] + half)
+            value = rho[rn, cn]
+            spread = max(max(a, b), max(d, e)) - min(min(a, b), min(d, e))
+            if spread < np.float32(0.05) * abs(value):
+                value = (a * (1 - fc) + b * fc) * (1 - fr) + (d * (1 - fc) + e * fc) * fr
+            k = 0
+            for n in range(1, baselines.size):
+                k = n if abs(value) * baselines[n] < np.float32(REACH) else k
+            sine = max(at[0, j], np.float32(0.01))
+            match = np.float32(_FLOOR) * at_pole[2]
+            by_angle = np.sqrt(match * match + pose[k, 0] * pose[k, 0]) / (baselines[k] * sine)
+            by_pose = value * (at[1, j] / sine * pose[k, 1] + pose[k, 2])
+            told = np.float32(_DEPENDENT * _DEPENDENT) / max(information[rn, cn],
+                                                            np.float32(1e-9))
+            out[i, j] = value
+            sigma_out[i, j] = min(np.sqrt(told + by_angle * by_angle + by_pose * by_pose), nothing)
+            second = other[rn, cn]
+            other_out[i, j] = second
+            pixels = tolerance[2, tolerance.shape[1] - 1]
+            for n in range(tolerance.shape[1]):
+                if abs(value) * tolerance[0, n] < tolerance[1, n]:
+                    pixels = tolerance[2, n]
+                    break
+            allowed = max(tolerance[3, 0] * abs(value), pixels)
+            agreed[i, j] = np.uint8(abs(value - second) < allowed)
+
+
+class JointMatcher:
+    """Measures a window.
+
+    method : 'joint', or 'joint_fast' (one refinement, and what was matched is the second opinion)
+    first : matches the nearest pair
+    """
+
+    def __init__(self, method: str, first: Matcher) -> None:
+        self._first = first
+        self._sweeps = method == 'joint'
+        self._windows = _WINDOWS[method]
+
+    def measure(self, current: Frame, references: Sequence[Reference]) -> Measurement:
+        """Inverse range of every pixel; `references` nearest first, all metric or none."""
+        pairs = [(r.frame.image, in_steps(r.pose)) for r in references]
+        height = current.image.shape[0]
+        grid = PolarGrid(height, MARGIN, MARGIN)
+        axes = polar_axes(pairs[0][1].direction)
+        view = np.asarray(resample(with_border(current.image),
+                                   polar_map(grid, axes, current.image.shape)), np.uint8)
+        matched = self._matched(view, pairs[0], grid, axes)
+        refined = self._refined(view, grid, axes, pairs, filled(matched))
+        if self._sweeps:
+            swept = [p for p in pairs if p[1].baseline <= _SWEPT * pairs[0][1].baseline]
+            coarse, _ = sweep(view, grid, axes, swept)
+            other = cv2.resize(coarse, grid.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            tolerance = _tolerance([p.baseline for _, p in swept], grid.pixel)
+        else:
+            other, tolerance = matched, _tolerance_of_match(pairs[0][1].baseline, grid.pixel)
+        return self._on_sphere(refined, other, tolerance, grid, axes, pairs, height)
+
+    def _matched(self, view: Image8, nearest: tuple[Image8, RelativePose], grid: PolarGrid,
+                 axes: Floats) -> Map:
+        image, pose = nearest
+        reference = np.asarray(resample(with_border(image), polar_map(
+            grid, pose.rotation.T @ axes, image.shape)), np.uint8)
+        parallax = self._first(view, like(reference, view))
+        rho = np.empty(grid.shape, np.float32)
+        rows_in_parallel(_nearness_rows, len(rho), parallax.pixels,
+                         np.asarray(grid.theta(), np.float32), np.float32(grid.pixel),
+                         np.float32(pose.baseline), rho)
+        return rho
+
+    def _refined(self, view: Image8, grid: PolarGrid, axes: Floats,
+                 pairs: Sequence[tuple[Image8, RelativePose]], start: Map) -> Refined:
+        refinement = JointRefinement(view, grid, axes, pairs)
+        found = refinement.refined(start, self._windows[0])
+        for window in self._windows[1:]:
+            found = refinement.refined(found.rho, window)
+        return found
+
+    @staticmethod
+    def _on_sphere(refined: Refined, other: Map, tolerance: Map, grid: PolarGrid, axes: Floats,
+                   pairs: Sequence[tuple[Image8, RelativePose]], height: int) -> Measurement:
+        rho, sigma, second = (np.empty((height, 2 * height), np.float32) for _ in range(3))
+        agreed = np.empty(rho.shape, np.uint8)
+        at_pole = np.array([grid.margin - 0.5, grid.wrap - 0.5, grid.pixel], np.float32)
+        poses = np.array([pose_sigmas(p) for _, p in pairs], np.float32)
+        baselines = np.array([p.baseline for _, p in pairs], np.float32)
+        rows_in_parallel(_measure_rows, height, *_grid_angles(height),
+                         np.ascontiguousarray(axes, np.float32), at_pole, refined.rho,
+                         refined.information, other, baselines, poses, tolerance, rho, sigma,
+                         second, agreed)
+        return Measurement(rho, sigma, second, agreed)
+
+
+def _tolerance(baselines: Sequence[float], pixel: float) -> Map:
+    """How far the sweep may be off, (4, N), longest baseline first: baseline, the most of baseline
+    over range to which it holds, 1/m; and in the last row the share of the inverse range.
+    """
+    rows = [(b, 0.6, _LEVELS * 2 * pixel / b, _AGREES) for b in sorted(baselines, reverse=True)]
+    return np.array(rows, np.float32).T.copy()
+
+
+def _tolerance_of_match(baseline: float, pixel: float) -> Map:
+    return np.array([[baseline, 1e9, _SLACK * pixel / baseline, 0.0]], np.float32).T.copy()
+
+
+def like(image: Image8, model: Image8) -> Image8:
+    """The image with the contrast and brightness of `model`, if they differ by over a twentieth."""
+    (mean, spread), (wanted, wanted_spread) = (
+        (float(m[0, 0]), float(s[0, 0])) for m, s in
+        (cv2.meanStdDev(i[::4, ::4]) for i in (image, model)))
+    gain = min(max(wanted_spread / max(spread, 1e-3), 0.3), 3.0)
+    if abs(np.log(gain)) < 0.05 and abs(mean - wanted) < 3:
+        return image
+    return np.asarray(cv2.convertScaleAbs(image, alpha=gain, beta=max(wanted - gain * mean, 0)),
+                      np.uint8)

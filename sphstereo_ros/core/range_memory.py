@@ -1,0 +1,173 @@
+"""What the frames before have told: range carried from frame to frame, with evidence.
+
+The range of the frame before, moved by the relative pose, is compared with the new measurement.
+Where they agree they are averaged and evidence grows; where nothing confirms it, evidence fades,
+and what is contradicted goes at once or within a few frames. A pixel is published when enough
+frames bear it out.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .frames import FrameKey, Image8, Reference, RelativePose
+from .history import PoseHistory
+from .inverse_range import NOTHING, _grid_angles
+from .jit import kernel, rows_in_parallel
+from .joint import Measurement, in_steps
+from .warp import Map, _arctan2
+
+_MOST = 6.0  # evidence
+_CONTRADICTED, _UNCONFIRMED, _UNSUPPORTED = 2.0, 1.0, 0.3  # what a frame takes away of it
+_AGREES, _SAME = 3.0, 0.02  # standard deviations, or share of the inverse range
+_OTHER = 0.05
+_GROWTH = 1.1  # of sigma from frame to frame: the world is not quite still
+_PUBLISHED = 2.0  # evidence that is enough
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """ρ (1/m), its σ (NOTHING where unknown), and evidence: float32 (H, 2H)."""
+
+    rho: Map
+    sigma: Map
+    evidence: Map
+
+
+@kernel
+def _move(old_rho: Map, old_sigma: Map, old_evidence: Map, cos_lat: Map, sin_lat: Map,
+          cos_lon: Map, sin_lon: Map, pose: Map, rho: Map, sigma: Map,
+          evidence: Map) -> None:  # pragma: no cover - compiled
+    """Every known pixel where the current camera sees it; what is nearest hides the rest."""
+    height, width = old_rho.shape
+    per_u, per_v = np.float32(width / (2 * np.pi)), np.float32(height / np.pi)
+    half, least = np.float32(0.5), np.float32(0.2)
+    for i in range(height):
+        for j in range(width):
+            if old_sigma[i, j] >= NOTHING:
+                continue
+            r = old_rho[i, j]
+            a, b, c = cos_lat[i] * sin_lon[j], -sin_lat[i], cos_lat[i] * cos_lon[j]
+            x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + r * pose[0, 3]
+            y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + r * pose[1, 3]
+            z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + r * pose[2, 3]
+            per_n = np.float32(1) / np.sqrt(x * x + y * y + z * z)
+            moved = r * per_n
+            u = _arctan2(x, z) * per_u + np.float32(width // 2) - half
+            v = _arctan2(y, np.sqrt(x * x + z * z)) * per_v + np.float32(height // 2) - half
+            u0, v0 = np.int32(np.floor(u)), np.int32(np.floor(v))
+            fu, fv = u - np.float32(u0), v - np.float32(v0)
+            for dv in range(2):
+                row = v0 + dv
+                if row < 0 or row >= height:
+                    continue
+                wv = fv if dv else 1 - fv
+                for du in range(2):
+                    if wv * (fu if du else 1 - fu) < least:
+                        continue
+                    column = (u0 + du) % width
+                    if sigma[row, column] >= NOTHING or moved > rho[row, column]:
+                        rho[row, column] = moved
+                        sigma[row, column] = old_sigma[i, j] * per_n * per_n
+                        evidence[row, column] = old_evidence[i, j]
+
+
+@kernel
+def _update_rows(first: int, last: int, new_rho: Map, new_sigma: Map, other: Map, agreed: Image8,
+                 fade: float, rho: Map, sigma: Map,
+                 evidence: Map) -> None:  # pragma: no cover - compiled
+    """The moved memory (rho, sigma, evidence) becomes the new one, pixel by pixel."""
+    for i in range(first, last):
+        for j in range(rho.shape[1]):
+            measured, spread = new_rho[i, j], new_sigma[i, j]
+            sure = agreed[i, j] != 0 and spread < NOTHING
+            if sigma[i, j] >= NOTHING:
+                rho[i, j] = measured if sure else np.float32(0)
+                sigma[i, j] = spread if sure else np.float32(NOTHING)
+                evidence[i, j] = np.float32(1) if sure else np.float32(0)
+                continue
+            old, s = rho[i, j], sigma[i, j] * np.float32(_GROWTH)
+            allowed = max(_AGREES * np.sqrt(s * s + spread * spread), _SAME * old)
+            same = abs(measured - old) < allowed
+            level = evidence[i, j]
+            if same:
+                w, w_new = 1 / (s * s), 1 / (spread * spread)
+                rho[i, j] = (w * old + w_new * measured) / (w + w_new)
+                s = np.float32(1) / np.sqrt(w + w_new)
+                level += np.float32(1) if sure else -np.float32(max(_UNSUPPORTED, fade))
+            elif sure:
+                level -= np.float32(_CONTRADICTED)
+                if level <= 0 or measured > old:  # what is nearer counts at once
+                    rho[i, j], s, level = measured, spread, np.float32(1)
+            else:
+                supported = abs(other[i, j] - old) < max(_OTHER * old, 3 * s)
+                level -= np.float32(max(_UNSUPPORTED if supported else _UNCONFIRMED, fade))
+            evidence[i, j] = min(level, np.float32(_MOST))
+            sigma[i, j] = s if level > 0 else np.float32(NOTHING)
+
+
+class RangeMemory:
+    """Fuses measurements over time.
+
+    seconds : how long what nothing confirms is kept at most
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self._history = PoseHistory()
+        self._key: FrameKey | None = None
+        self._kept: Remembered | None = None
+        self._frames = 0
+        self._metric = True
+
+    def fused(self, key: FrameKey, references: tuple[Reference, ...], new: Measurement,
+              vehicle: NDArray[np.bool_] | None = None) -> Remembered:
+        """Memory and the new measurement of frame `key` as one; it is the memory from now on.
+
+        The result has only what enough frames bear out.
+        """
+        metric = all(r.pose.is_metric for r in references)
+        if vehicle is not None:
+            new.agreed[vehicle] = 0
+        moved = self._moved(key, references, metric, new.rho.shape)
+        fade = self._fade(key)
+        rows_in_parallel(_update_rows, len(new.rho), new.rho, new.sigma, new.other, new.agreed,
+                         fade, moved.rho, moved.sigma, moved.evidence)
+        self._key, self._kept, self._metric = key, moved, metric
+        self._frames += 1
+        enough = moved.evidence >= min(self._frames, _PUBLISHED)
+        return Remembered(moved.rho, np.where(enough, moved.sigma, np.float32(NOTHING)),
+                          moved.evidence)
+
+    def _fade(self, key: FrameKey) -> float:
+        """What time alone takes of the evidence of one frame."""
+        if self._key is None or self._seconds <= 0:
+            return _MOST
+        return _MOST * (key.stamp - self._key.stamp) * 1e-9 / self._seconds
+
+    def _moved(self, key: FrameKey, references: tuple[Reference, ...], metric: bool,
+               shape: tuple[int, ...]) -> Remembered:
+        """What was kept, as the camera of frame `key` would see it; empty if that is unknown."""
+        empty = Remembered(np.zeros(shape, np.float32), np.full(shape, NOTHING, np.float32),
+                           np.zeros(shape, np.float32))
+        self._history.begin(key)
+        for reference in references:
+            self._history.add(key, reference.frame.key, in_steps(reference.pose))
+        pose = self._pose_of_kept(key)
+        if pose is None or self._kept is None or self._kept.rho.shape != shape or (
+                metric != self._metric):
+            self._frames = 0
+            return empty
+        placed = np.column_stack([pose.rotation, pose.position]).astype(np.float32)
+        _move(self._kept.rho, self._kept.sigma, self._kept.evidence, *_grid_angles(shape[0]),
+              placed, empty.rho, empty.sigma, empty.evidence)
+        return empty
+
+    def _pose_of_kept(self, key: FrameKey) -> RelativePose | None:
+        if self._key is None or self._seconds <= 0 or key <= self._key or (
+                key.frame_id != self._key.frame_id
+                or (key.stamp - self._key.stamp) * 1e-9 > self._seconds):
+            return None
+        return self._history.between(self._key, key)

@@ -1,0 +1,152 @@
+"""Joint refinement: inverse range from all references at once, to a fraction of a pixel.
+
+Each reference is resampled as the current view would see it by the range known so far; what still
+differs in grey is put down to the range by Lucas and Kanade's linearisation (1981) along the
+epipolar direction. A window's measurements of all references are averaged by what they tell, so a
+long baseline decides far away and a short one near by. References that do not fit where others
+do (occluded there, or moved) are left out.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .frames import Image8, RelativePose
+from .jit import fast_kernel, rows_in_parallel
+from .relief import reference_in_relief
+from .warp import Map, PolarGrid
+
+Floats = NDArray[np.float64]
+
+_NOISE = 2.0  # grey levels, of the difference of two views beside what range explains
+_MOST = 400.0  # squared grey levels: a worse difference tells no more than that it does not fit
+_FIT_WINDOW, _MEAN_WINDOW = 7, 21
+_UNFIT = 4.0  # a reference is left out where it fits that much worse than the best
+REACH = 0.7  # baseline over range beyond which a reference looks too different
+
+
+@dataclass(frozen=True)
+class Refined:
+    """rho : 1/m on the polar grid; information : (1/m)⁻², what the differences in grey tell of it
+    if they are independent; misfit : mean squared grey difference of the best reference
+    """
+
+    rho: Map
+    information: Map
+    misfit: Map
+
+
+@fast_kernel
+def _differences(first: int, last: int, current: Image8, mean: Map, view: Image8, view_mean: Map,
+                 gain: np.float32, rho: Map, cos_theta: Map, sin_theta: Map, cos_azimuth: Map,
+                 sin_azimuth: Map, position: Map, per_pixel: np.float32, slope: Map, error: Map,
+                 squared: Map) -> None:  # pragma: no cover - compiled
+    """Difference in grey, and by how much it would change with ρ; `position` in polar axes."""
+    rows, columns = current.shape
+    quarter, one = np.float32(0.25) * per_pixel, np.float32(1)
+    for i in range(first, last):
+        above, below = max(i - 1, 0), min(i + 1, rows - 1)
+        radial = position[0] * cos_azimuth[i] + position[1] * sin_azimuth[i]
+        across = position[1] * cos_azimuth[i] - position[0] * sin_azimuth[i]
+        for j in range(columns):
+            left, right = max(j - 1, 0), min(j + 1, columns - 1)
+            s, c = sin_theta[j], cos_theta[j]
+            gx = quarter * (np.float32(view[i, right]) - np.float32(view[i, left])
+                            + np.float32(current[i, right]) - np.float32(current[i, left]))
+            gy = quarter * (np.float32(view[below, j]) - np.float32(view[above, j])
+                            + np.float32(current[below, j]) - np.float32(current[above, j]))
+            along = radial * c - position[2] * s
+            depth = radial * s + position[2] * c
+            slope[i, j] = -(gx * along + gy * across / max(abs(s), np.float32(0.02))) / max(
+                one - rho[i, j] * depth, np.float32(0.05))
+            e = (np.float32(current[i, j]) - mean[i, j]
+                 - gain * (np.float32(view[i, j]) - view_mean[i, j]))
+            error[i, j] = e
+            squared[i, j] = min(e * e, np.float32(_MOST))
+
+
+@fast_kernel
+def _collect(first: int, last: int, rho: Map, slope: Map, error: Map, fit: Map, best: Map,
+             baseline: np.float32, weighted: Map,
+             weight: Map) -> None:  # pragma: no cover - compiled
+    """Add one reference's measurements where it fits and is not too far away."""
+    noise = np.float32(_NOISE * _NOISE)
+    for i in range(first, last):
+        for j in range(rho.shape[1]):
+            good = (fit[i, j] < np.float32(_UNFIT) * best[i, j] + 2 * noise) & (
+                abs(rho[i, j]) * baseline < np.float32(REACH))
+            w = one_if(good) / (fit[i, j] + noise)
+            gg = w * slope[i, j] * slope[i, j]
+            weighted[i, j] += w * slope[i, j] * error[i, j] + gg * rho[i, j]
+            weight[i, j] += gg
+
+
+@fast_kernel
+def one_if(condition: bool) -> np.float32:  # pragma: no cover - compiled
+    """1 or 0."""
+    return np.float32(1) if condition else np.float32(0)
+
+
+def _mean(image: NDArray[np.uint8]) -> Map:
+    return np.asarray(cv2.boxFilter(image, cv2.CV_32F, (_MEAN_WINDOW, _MEAN_WINDOW)))
+
+
+def _gain(current: Image8, mean: Map, view: Image8, view_mean: Map) -> np.float32:
+    """How much more contrast the current view has."""
+    a = (current[::4, ::4] - mean[::4, ::4]).ravel()
+    b = (view[::4, ::4] - view_mean[::4, ::4]).ravel()
+    ratio = np.sqrt(float(a @ a) / max(float(b @ b), 1e-9))
+    return np.float32(min(max(ratio, 0.3), 3.0))
+
+
+class JointRefinement:
+    """The current view on a polar grid, to which references are fitted.
+
+    Parameters
+    ----------
+    current : the current view on `grid`, uint8
+    grid, axes : the grid and its axes (3, 3) in the current optical frame
+    references : equirectangular images (H, 2H) and poses, nearest first
+
+    """
+
+    def __init__(self, current: Image8, grid: PolarGrid, axes: Floats,
+                 references: Sequence[tuple[Image8, RelativePose]]) -> None:
+        self._current, self._mean = current, _mean(current)
+        self._grid, self._axes, self._references = grid, axes, references
+        theta, azimuth = grid.theta(), grid.azimuth()
+        self._angles = [np.ascontiguousarray(a, np.float32) for a in (
+            np.cos(theta), np.sin(theta), np.cos(azimuth), np.sin(azimuth))]
+
+    def refined(self, rho: Map, window: int) -> Refined:
+        """One step from `rho` (1/m, of the grid's shape), averaged in windows of `window` px."""
+        found = [self._difference(image, pose, rho) for image, pose in self._references]
+        best = found[0][2].copy()
+        for _, _, fit in found[1:]:
+            np.minimum(best, fit, out=best)
+        weighted, weight = np.zeros_like(rho), np.zeros_like(rho)
+        for (slope, error, fit), (_, pose) in zip(found, self._references, strict=True):
+            rows_in_parallel(_collect, len(rho), rho, slope, error, fit, best,
+                             np.float32(pose.baseline), weighted, weight)
+        size = (window, window)
+        sums, information = (cv2.boxFilter(m, -1, size, normalize=False)
+                             for m in (weighted, weight))
+        # Where nothing is told, the start stays.
+        hold = np.float32(1e-3)
+        return Refined((sums + hold * rho) / (information + hold), information, best)
+
+    def _difference(self, image: Image8, pose: RelativePose, rho: Map) -> tuple[Map, Map, Map]:
+        view = reference_in_relief(image, pose, self._grid, self._axes, rho)
+        view_mean = _mean(view)
+        slope, error, squared = (np.empty_like(rho) for _ in range(3))
+        position = np.asarray(self._axes.T @ pose.position, np.float32)
+        gain = _gain(self._current, self._mean, view, view_mean)
+        rows_in_parallel(_differences, len(rho), self._current, self._mean, view, view_mean, gain,
+                         rho, *self._angles, position, np.float32(1 / self._grid.pixel), slope,
+                         error, squared)
+        fit = cv2.boxFilter(squared, -1, (_FIT_WINDOW, _FIT_WINDOW))
+        return slope, error, fit
