@@ -141,11 +141,14 @@ class JointMatcher:
 
     method : 'joint', or 'joint_fast' (one refinement, and what was matched is the second opinion)
     first : matches the nearest pair
+    baseline_sigma : relative standard deviation of a baseline where its pose tells none
     """
 
-    def __init__(self, method: str, first: Matcher) -> None:
+    def __init__(self, method: str, first: Matcher, baseline_sigma: float = 0.0) -> None:
         self._first = first
+        self._baseline_sigma = baseline_sigma
         self._sweeps = method == 'joint'
+        self.signed = self._sweeps  # block matching cannot say that a point is beyond all range
         self._windows = _WINDOWS[method]
 
     def measure(self, current: Frame, references: Sequence[Reference]) -> Measurement:
@@ -187,13 +190,14 @@ class JointMatcher:
             found = refinement.refined(found.rho, window)
         return found
 
-    @staticmethod
-    def _on_sphere(refined: Refined, other: Map, tolerance: Map, grid: PolarGrid, axes: Floats,
-                   pairs: Sequence[tuple[Image8, RelativePose]], height: int) -> Measurement:
+    def _on_sphere(self, refined: Refined, other: Map, tolerance: Map, grid: PolarGrid,
+                   axes: Floats, pairs: Sequence[tuple[Image8, RelativePose]],
+                   height: int) -> Measurement:
         rho, sigma, second = (np.empty((height, 2 * height), np.float32) for _ in range(3))
         agreed = np.empty(rho.shape, np.uint8)
         at_pole = np.array([grid.margin - 0.5, grid.wrap - 0.5, grid.pixel], np.float32)
         poses = np.array([pose_sigmas(p) for _, p in pairs], np.float32)
+        poses[poses[:, 2] == 0, 2] = self._baseline_sigma
         baselines = np.array([p.baseline for _, p in pairs], np.float32)
         rows_in_parallel(_measure_rows, height, *_grid_angles(height),
                          np.ascontiguousarray(axes, np.float32), at_pole, refined.rho,
@@ -215,7 +219,7 @@ def _tolerance_of_match(baseline: float, pixel: float) -> Map:
 
 
 def like(image: Image8, model: Image8) -> Image8:
-    """The image with the contrast and brightness of `model`, if they differ by over a twentieth."""
+    """The image with the contrast and brightness of `model`, where they differ by much."""
     (mean, spread), (wanted, wanted_spread) = (
         (float(m[0, 0]), float(s[0, 0])) for m, s in
         (cv2.meanStdDev(i[::4, ::4]) for i in (image, model)))

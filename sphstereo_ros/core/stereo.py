@@ -39,7 +39,8 @@ class SphericalStereo:
         self._match = matcher(config.stereo)
         self._joint: JointMatcher | None = None
         if config.stereo.matcher in ('joint', 'joint_fast'):
-            self._joint = JointMatcher(config.stereo.matcher, self._match)
+            self._joint = JointMatcher(config.stereo.matcher, self._match,
+                                       config.baseline.relative_sigma)
         self._memory = RangeMemory(config.stereo.memory)
         self._mask = mask
 
@@ -75,7 +76,7 @@ class SphericalStereo:
         measured = joint.measure(window.current, window.references)
         fused = self._memory.fused(window.current.key, window.references, measured,
                                    None if mask is None else mask != 0)
-        return InverseRange(fused.rho, fused.sigma, signed=True)
+        return InverseRange(fused.rho, fused.sigma, joint.signed)
 
     def _measure(self, current: Frame, reference: Reference) -> InverseRange:
         height = current.image.shape[0]

@@ -26,13 +26,14 @@ Census = NDArray[np.uint32]
 Volume = NDArray[np.uint16]
 
 _MARGIN = 8
-_NEAREST = 0.3  # m: the last level
+_NEAREST = 0.3  # m: the last level, at the latest
+_CLOSEST, _MOST_LEVELS = 2.0, 256  # of the nearest baseline over range
 _LEVEL = 1.5  # px of parallax between levels, of the longest baseline in use
-_REACH = 0.6  # baseline over range up to which a reference takes part; beyond, it looks too different
+_REACH = 0.6  # baseline over range up to which a reference takes part: it looks alike
 _UNSEEN = 20  # cost of a level for a reference that takes no part
 _CONTRAST, _CONTRAST_LIMIT = 4, 12  # eighths of cost a grey level, and the most of it
 _BLUR = 15
-# Penalties for a change by one level, and by more: from _JUMP down to _EDGE where grey changes too.
+# Penalties for a change by one level, and by more: less, from _JUMP to _EDGE, where grey changes.
 _STEP, _JUMP, _EDGE, _EDGE_GREY = 10, 200, 40, 8
 _FREE = 60000  # beyond the first and the last level
 
@@ -53,7 +54,8 @@ def levels(baselines: Sequence[float], pixel: float) -> Floats:
     """
     longest_first = sorted(baselines, reverse=True)
     found = [-2 * _LEVEL * pixel / longest_first[0]]
-    while found[-1] < 1 / _NEAREST:
+    nearest = min(1 / _NEAREST, _CLOSEST / longest_first[-1])
+    while found[-1] < nearest and len(found) < _MOST_LEVELS:
         usable = [b for b in longest_first if found[-1] * b <= _REACH] or longest_first[-1:]
         near = found[-1] * usable[0] > _REACH
         found.append(found[-1] + (2.0 if near else _LEVEL) * pixel / usable[0])
@@ -132,7 +134,7 @@ def _cost_rows(first: int, last: int, census: Census, contrast: Image8, ref_cens
             for k in range(used):
                 c = min(max(int(table[at, k] + offset), 0), columns - 1)
                 bits = 2 * _different_bits(here, ref_census[r, c])
-                off = (abs(grey - np.int32(ref_contrast[r, c])) * _CONTRAST) >> 3
+                off = int(abs(grey - np.int32(ref_contrast[r, c])) * _CONTRAST) >> 3
                 cost[i, j, k] += np.uint16(bits + min(off, _CONTRAST_LIMIT))
             for k in range(used, cost.shape[2]):
                 cost[i, j, k] += np.uint16(_UNSEEN)
@@ -149,7 +151,7 @@ def _scale_rows(first: int, last: int, volume: Volume, weight: float,
 
 
 @kernel
-def _advance(cost: NDArray[np.uint8], before: NDArray[np.uint16], least: int, jump: int,
+def _advance(cost: NDArray[np.uint8], before: NDArray[np.uint16], least: np.uint16, jump: int,
              total: NDArray[np.uint16],
              now: NDArray[np.uint16]) -> np.uint16:  # pragma: no cover - compiled
     """One pixel further along a path: its costs `now`, added to `total`; returns the least."""
@@ -169,7 +171,7 @@ def _advance(cost: NDArray[np.uint8], before: NDArray[np.uint16], least: int, ju
 @kernel
 def _jump(image: Image8, i: int, j: int, ip: int,
           jp: int) -> int:  # pragma: no cover - compiled
-    step = abs(np.int32(image[i, j]) - np.int32(image[ip, jp]))
+    step = int(abs(np.int32(image[i, j]) - np.int32(image[ip, jp])))
     return max(_EDGE, _JUMP * _EDGE_GREY // (_EDGE_GREY + step))
 
 
