@@ -212,6 +212,21 @@ def test_a_changing_speed_shows_in_the_far_length(order: tuple[int, ...]) -> Non
     assert within(errors(out, order[-1] - out.references[1].frame.key.stamp + 1000), 0.02, 0.05)
 
 
+def test_no_distance_at_all_is_a_named_drop() -> None:
+    """Odometry may say so where `baseline.minimum` is zero, and the images too."""
+    stages = driven(5, 1, 4)
+    window = paired(6, 1, 4)
+    still = PairedWindow(window.current, tuple(
+        Reference(frame(r.frame.key.stamp - 1000, views()[6].image),
+                  RelativePose(np.eye(3), np.zeros(3))) for r in window.references))
+    out = stages.process(still)
+    assert isinstance(out, Drop)
+    assert out.cause == 'no_parallax'
+    moved = PairedWindow(window.current, (window.references[0], replace(
+        window.references[1], pose=RelativePose(np.eye(3), np.zeros(3)))))
+    assert isinstance(stages.process(moved), AlignedWindow)
+
+
 def test_a_measured_length_stays() -> None:
     out = speeding((0, 3, 6, 8, 9, 10), 'odometry')
     assert [r.pose.baseline for r in out.references] == pytest.approx([STEP, 4 * STEP])

@@ -347,6 +347,12 @@ def test_covariances_of_all_references_survive_the_way(scale: float) -> None:
             np.testing.assert_allclose(reference.pose.covariance, spread(seed), rtol=1e-12)
 
 
+def test_covariances_of_messages_are_of_the_position_first() -> None:
+    message, = told(aligned(np.diag([1.0, 2.0, 3.0, 40.0, 50.0, 60.0])))
+    assert list(np.diag(np.reshape(message.pose.covariance, (6, 6)))) == [40, 50, 60, 1, 2, 3]
+    assert (message.header.stamp.sec, message.header.frame_id) == (2, 'c')
+
+
 def test_a_known_covariance_stays_and_another_frames_is_not_taken() -> None:
     covariances = Covariances()
     for message in told(aligned(spread())):

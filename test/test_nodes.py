@@ -30,6 +30,7 @@ from sphstereo_ros.core.motion import OdometrySample
 from sphstereo_ros.nodes.frame_pairing import TransportChoice
 
 STEP, HEIGHT = 0.15, 240
+FULL = 12  # frames until a window has all its references, and one more
 STAGES = ('frame_pairing', 'pose_stabilisation', 'motion_alignment', 'spherical_stereo')
 
 
@@ -46,15 +47,15 @@ def frames(count: int = 5) -> tuple[Frame, ...]:
 
 def moved(i: int) -> tuple[int, float]:
     """Stamp and forward position of frame i."""
-    return frames()[i].key.stamp, STEP * i
+    return frames(FULL)[i].key.stamp, STEP * i
 
 
 @cache
-def truth(source: str, matcher: str = 'bm') -> dict[int, StageResults]:
+def truth(source: str, matcher: str = 'bm', count: int = 5) -> dict[int, StageResults]:
     """What the core makes of the same frames, by stamp."""
     chain = Chain(resolve({'baseline.source': source, 'stereo.matcher': matcher}))
     results = []
-    for i, frame in enumerate(frames()):
+    for i, frame in enumerate(frames(count)):
         stamp, x = moved(i)
         if source == 'odometry':
             chain.add_odometry(OdometrySample(stamp, np.array([x, 0, 0]), np.eye(3)))
@@ -82,14 +83,14 @@ def test_four_processes_give_what_the_core_gives(ros: Graph) -> None:
         client.linked(topic, readers)
     motion = client.publisher(Odometry, 'odometry')
     image = client.heard(Image, 'image', 'frame_pairing')
-    for i, frame in enumerate(frames()):
+    for i, frame in enumerate(frames(FULL)):
         motion.publish(odometry(*moved(i)))
         image.publish(mono8(frame.key.stamp, frame.image))
         if i:
             client.stamped('points', frame.key.stamp)
-    expected = truth('odometry')
-    assert sorted(expected) == [f.key.stamp for f in frames()[1:]]
-    assert len(expected[frames()[-1].key.stamp].aligned.references) == 2
+    expected = truth('odometry', count=FULL)
+    assert sorted(expected) == [f.key.stamp for f in frames(FULL)[1:]]
+    assert len(expected[frames(FULL)[-1].key.stamp].aligned.references) == 3
     for stamp, result in expected.items():
         depth, sigma = client.stamped('depth/image', stamp), client.stamped('depth/sigma', stamp)
         assert (depth.header.frame_id, sigma.header.frame_id) == ('camera_optical',) * 2
@@ -109,7 +110,7 @@ def test_four_processes_give_what_the_core_gives(ros: Graph) -> None:
     for topic in ('image', 'image/compressed'):
         info, = client.node.get_subscriptions_info_by_topic(topic)
         assert info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-    last = frames()[-1].key.stamp
+    last = frames(FULL)[-1].key.stamp
     client.until(lambda: set(client.statuses()) == set(STAGES), 'diagnostics of all')
     assert nanoseconds(client.received['depth/image'][-1].header.stamp) == last
     for name in STAGES:

@@ -148,7 +148,8 @@ class Aligner:
         """Where the poses of earlier windows put the reference, or else stage 2."""
         chained = self._history.between(reference.frame.key, current)
         believed = reference.pose.baseline
-        if chained is None or not _LIKELY < chained.baseline / believed < 1 / _LIKELY:
+        if chained is None \
+                or not _LIKELY * believed < chained.baseline < believed / _LIKELY:
             return reference.pose
         return chained if self._assumes_steps else with_baseline(chained, believed)
 
