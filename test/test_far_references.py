@@ -10,7 +10,7 @@ import pytest
 from analytic_world import View, World, look, true_pose
 from two_views import angle_between, matches, random_rotation, two_views
 
-from sphstereo_ros.core import rotations
+from sphstereo_ros.core import rotations, tracking
 from sphstereo_ros.core.aligned_view import CurrentView, length_by_ranges, nearness
 from sphstereo_ros.core.alignment import Aligner
 from sphstereo_ros.core.config import resolve
@@ -131,6 +131,17 @@ def test_stage_2_predicts_without_tracking(monkeypatch: pytest.MonkeyPatch) -> N
     out = stages.stabiliser.process(paired(11, 1, 4, 10))
     assert len(out.references) == 3
     assert len(calls) == 1
+
+
+def test_stage_3_starts_from_its_own_chain() -> None:
+    """Whatever stage 2 says of the far reference: 5° wrong, it could not be followed."""
+    stages = driven(10, 1, 4, 10)
+    window = stages.stabiliser.process(paired(11, 1, 10))
+    near, far = window.references
+    wrong = replace(far, pose=replace(far.pose, rotation=rotations.exp((0.09, 0, 0))
+                                      @ far.pose.rotation))
+    out = stages.aligner.process(replace(window, references=(near, wrong)))
+    assert within(errors(out, 10), 0.01, 0.02)
 
 
 def test_where_frames_were_dropped_the_way_leads_over_other_windows() -> None:
@@ -315,8 +326,13 @@ def test_values_between_pixels() -> None:
     assert found == pytest.approx([12.5, 45.5], abs=0.1)
 
 
-def test_followed_both_ways_leaves_out_what_is_hidden() -> None:
-    """A patch moves over a still ground: what is at its edge cannot be followed."""
+@pytest.mark.parametrize('switched_off', ['_ALIKE', '_FOUND_BACK'])
+def test_followed_both_ways_leaves_out_what_is_hidden(
+        monkeypatch: pytest.MonkeyPatch, switched_off: str) -> None:
+    """A patch moves over a still ground: what is at its edge cannot be followed. Either check
+    finds most of it.
+    """
+    monkeypatch.setattr(tracking, switched_off, 1.0 if switched_off == '_ALIKE' else np.inf)
     rng = np.random.default_rng(2)
     ground, patch = (cv2.GaussianBlur(rng.integers(0, 255, (200, 300), np.uint8), (0, 0), 2)
                      for _ in range(2))
