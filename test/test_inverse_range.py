@@ -296,3 +296,14 @@ def test_mask_is_unknown():
 def test_no_minimum_makes_nothing_too_near():
     r, _ = published_range(estimate([1000.0], [0.1]), RangeConfig(minimum=0.0), True)
     np.testing.assert_allclose(r, 0.001, rtol=1e-5)
+
+
+def test_where_a_search_ends_the_long_baseline_does_not_speak_alone():
+    """A near point beyond the search of the long pair reads far there."""
+    unknown = InverseRange(np.zeros((1, 1), np.float32), np.full((1, 1), NOTHING, np.float32),
+                           signed=False)
+    far = InverseRange(np.full((1, 1), 0.02, np.float32), np.full((1, 1), 1e-3, np.float32),
+                       signed=False)
+    assert fuse([unknown, far]).sigma >= NOTHING
+    flows = [InverseRange(e.rho, e.sigma, signed=True) for e in (unknown, far)]
+    assert fuse(flows).rho == pytest.approx(0.02)

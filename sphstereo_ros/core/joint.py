@@ -33,7 +33,7 @@ _AGREES, _LEVELS = 0.05, 0.75  # of the inverse range, or so many pixels at half
 _SLACK = 1.5  # px of the nearest pair by which refinement may move what was matched
 # The error model, fitted to the tuning scenes: differences in grey within a window are not
 # independent, and no match is better than a share of a pixel.
-_DEPENDENT, _FLOOR = 3.0, 0.1
+_DEPENDENT, _FLOOR = 4.0, 0.17
 _WINDOWS = {'joint': (9, 9), 'joint_fast': (9,)}
 _CELL, _SPREADS = 8, (1.0, 6.0)  # px, cells: how what was not matched is filled for a start
 

@@ -23,7 +23,7 @@ _MOST = 6.0  # evidence
 _CONTRADICTED, _UNCONFIRMED, _UNSUPPORTED = 2.0, 1.0, 0.3  # what a frame takes away of it
 _AGREES, _SAME = 3.0, 0.02  # standard deviations, or share of the inverse range
 _OTHER = 0.05
-_GROWTH = 1.1  # of sigma from frame to frame: the world is not quite still
+_GROWTH = 1.25  # of sigma from frame to frame: errors of consecutive frames are much alike
 _PUBLISHED = 2.0  # evidence that is enough
 
 
