@@ -177,8 +177,8 @@ def fuse(estimates: list[InverseRange]) -> InverseRange:
     """Average by inverse variance what agrees within three standard deviations, nearest first.
 
     Where a longer baseline contradicts what is already there, it is wrong as a rule (its search or
-    its occlusions): the shorter one's estimate stays. Where a search that ends takes part, a longer
-    baseline does not speak alone: it reports what is nearer than its search as far.
+    its occlusions): the shorter one's estimate stays. Where a search that ends takes part, a
+    longer baseline does not speak alone: it reports what is nearer than its search as far.
     """
     rho, sigma, signed = estimates[0].rho, estimates[0].sigma, estimates[0].signed
     for more in estimates[1:]:
