@@ -11,7 +11,7 @@ import numpy as np
 from sphstereo_ros.core.chain import Chain, StageResults
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import Frame, FrameKey, Image8
-from sphstereo_ros.core.stereo import stereo_grid
+from sphstereo_ros.core.matching import stereo_grid
 from sphstereo_ros.core.warp import aligned_pair
 
 # Frames (H, 2H) of a moving camera, or one array (N, H, 2H) of them.

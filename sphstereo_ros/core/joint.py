@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from .frames import UNSCALED, Frame, Image8, Reference, RelativePose
 from .inverse_range import NOTHING, _grid_angles, _polar_row, pose_sigmas
 from .jit import kernel, rows_in_parallel
-from .matching import MARGIN, UNKNOWN, Matcher
+from .matching import UNKNOWN, Matcher, stereo_grid
 from .refinement import REACH, JointRefinement, Refined
 from .sphere import polar_axes
 from .sweep import sweep
@@ -155,7 +155,7 @@ class JointMatcher:
         """Inverse range of every pixel; `references` nearest first, all metric or none."""
         pairs = [(r.frame.image, in_steps(r.pose)) for r in references]
         height = current.image.shape[0]
-        grid = PolarGrid(height, MARGIN, MARGIN)
+        grid = stereo_grid(height)
         axes = polar_axes(pairs[0][1].direction)
         view = np.asarray(resample(with_border(current.image),
                                    polar_map(grid, axes, current.image.shape)), np.uint8)

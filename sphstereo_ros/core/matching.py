@@ -18,6 +18,7 @@ from .block_matching import MAX_BLOCK, UNIQUE, block_match
 from .config import StereoConfig
 from .frames import Image8
 from .jit import kernel, rows_in_parallel
+from .warp import PolarGrid
 
 Pixels = NDArray[np.float32]
 
@@ -26,7 +27,17 @@ Bounds = tuple[float, float]
 # Pixels round an aligned pair that need not be matched: they are there for windows to see.
 MARGIN = 8
 
+_HALVINGS = 4  # how much coarser a grid gets at most: its height can be divided by that
+
 UNKNOWN = -1e5  # more than a turn at any size
+
+
+def stereo_grid(height: int) -> PolarGrid:
+    """The grid on which frames of `height` rows are matched: the next height that halves evenly.
+
+    Where halving loses a row, everything coarse would be misplaced.
+    """
+    return PolarGrid(-(-height // _HALVINGS) * _HALVINGS, MARGIN, MARGIN)
 
 
 @dataclass(frozen=True)

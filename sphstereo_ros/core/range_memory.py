@@ -56,7 +56,7 @@ def _move(old_rho: Map, old_sigma: Map, old_evidence: Map, cos_lat: Map, sin_lat
             per_n = np.float32(1) / np.sqrt(x * x + y * y + z * z)
             moved = r * per_n
             u = _arctan2(x, z) * per_u + np.float32(width // 2) - half
-            v = _arctan2(y, np.sqrt(x * x + z * z)) * per_v + np.float32(height // 2) - half
+            v = _arctan2(y, np.sqrt(x * x + z * z)) * per_v + np.float32(0.5 * height) - half
             u0, v0 = np.int32(np.floor(u)), np.int32(np.floor(v))
             fu, fv = u - np.float32(u0), v - np.float32(v0)
             for dv in range(2):
@@ -129,12 +129,11 @@ class RangeMemory:
         The result has only what enough frames bear out.
         """
         metric = all(r.pose.is_metric for r in references)
-        if vehicle is not None:
-            new.agreed[vehicle] = 0
+        agreed = new.agreed if vehicle is None else np.where(vehicle, np.uint8(0), new.agreed)
         moved = self._moved(key, references, metric, new.rho.shape)
         fade = self._fade(key)
-        rows_in_parallel(_update_rows, len(new.rho), new.rho, new.sigma, new.other, new.agreed,
-                         fade, moved.rho, moved.sigma, moved.evidence)
+        rows_in_parallel(_update_rows, len(new.rho), new.rho, new.sigma, new.other, agreed, fade,
+                         moved.rho, moved.sigma, moved.evidence)
         self._key, self._kept, self._metric = key, moved, metric
         self._frames += 1
         enough = moved.evidence >= min(self._frames, _PUBLISHED)
@@ -152,6 +151,8 @@ class RangeMemory:
         """What was kept, as the camera of frame `key` would see it; empty if that is unknown."""
         empty = Remembered(np.zeros(shape, np.float32), np.full(shape, NOTHING, np.float32),
                            np.zeros(shape, np.float32))
+        if metric != self._metric:  # poses in metres and in steps make no chain
+            self._history = PoseHistory()
         self._history.begin(key)
         for reference in references:
             self._history.add(key, reference.frame.key, in_steps(reference.pose))

@@ -1,6 +1,8 @@
 """Stage 4, spherical stereo: an aligned window becomes a range image."""
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 
@@ -17,14 +19,9 @@ from .frames import (
 )
 from .inverse_range import InverseRange, fuse, inverse_range, published_range
 from .joint import JointMatcher
-from .matching import MARGIN, matcher
+from .matching import matcher, stereo_grid
 from .range_memory import RangeMemory
-from .warp import PolarGrid, aligned_pair
-
-
-def stereo_grid(height: int) -> PolarGrid:
-    """The grid on which frames of `height` rows are matched."""
-    return PolarGrid(height, MARGIN, MARGIN)
+from .warp import aligned_pair
 
 
 class SphericalStereo:
@@ -47,9 +44,10 @@ class SphericalStereo:
     def warm_up(self) -> None:
         """Compile what `process` needs."""
         noise = np.random.default_rng(0).integers(0, 255, (128, 256), np.uint8)
-        frames = [Frame(FrameKey(stamp, ''), noise) for stamp in range(2)]
+        frames = [Frame(FrameKey(stamp, ''), noise) for stamp in range(3)]
         pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -1.0]), 1e-9 * np.eye(6))
-        self.process(AlignedWindow(frames[1], (Reference(frames[0], pose),)))
+        for reference, current in pairwise(frames):  # the second time, there is a memory
+            self.process(AlignedWindow(current, (Reference(reference, pose),)))
         self._memory = RangeMemory(self.config.stereo.memory)
 
     def process(self, window: AlignedWindow) -> RangeImage | Drop:

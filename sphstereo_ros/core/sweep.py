@@ -239,7 +239,8 @@ def _winner_rows(first: int, last: int, total: Volume, level: Map,
 
 
 def _half(image: Image8) -> Image8:
-    return np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    rows, columns = image.shape  # of an odd number, what is left over is spread evenly
+    return np.asarray(cv2.resize(image, (columns // 2, rows // 2), interpolation=cv2.INTER_AREA))
 
 
 def _polar_table(grid: PolarGrid, level: Floats, baseline: float) -> Map:
