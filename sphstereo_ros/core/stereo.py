@@ -18,6 +18,7 @@ from .frames import (
     RelativePose,
 )
 from .inverse_range import InverseRange, fuse, inverse_range, published_range
+from .islands import far_islands
 from .joint import JointMatcher
 from .matching import matcher, stereo_grid
 from .range_memory import RangeMemory
@@ -67,6 +68,9 @@ class SphericalStereo:
         else:
             estimate = fuse([self._measure(window.current, r) for r in window.references])
         r, sigma = published_range(estimate, self.config.range, window.is_metric, mask)
+        if self._joint is not None and window.is_metric:
+            hidden = far_islands(r)
+            r[hidden] = sigma[hidden] = np.nan
         return RangeImage(window.current.key, r, sigma, window.is_metric)
 
     def _remembered(self, joint: JointMatcher, window: AlignedWindow,

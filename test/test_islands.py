@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sphstereo_ros.core.islands import far_islands
+
+HEIGHT = 240
+
+
+def room(distance: float) -> np.ndarray:
+    return np.full((HEIGHT, 2 * HEIGHT), distance, np.float32)
+
+
+@pytest.mark.parametrize('beyond', [12.0, np.inf])
+def test_a_mirror_in_something_near_is_unknown(beyond):
+    r = room(3.0)
+    r[100:112, 200:216] = beyond
+    r[98:100, 190:230] = np.nan  # its frame
+    found = far_islands(r)
+    assert found[100:112, 200:216].all()
+    found[100:112, 200:216] = False
+    assert not found.any()
+
+
+def test_what_is_little_farther_stays():
+    r = room(3.0)
+    r[100:112, 200:216] = 3.6
+    assert not far_islands(r).any()
+
+
+def test_a_wide_view_stays():
+    r = room(3.0)
+    r[60:140, 100:260] = 20
+    assert not far_islands(r).any()
+
+
+def test_a_far_patch_among_far_things_stays():
+    r = room(15.0)
+    r[100:112, 200:216] = 80
+    assert not far_islands(r).any()
+
+
+def test_a_near_patch_among_far_things_stays():
+    r = room(40.0)
+    r[100:112, 200:216] = 2.5
+    assert not far_islands(r).any()
+
+
+def test_an_island_amid_what_is_unknown_stays():
+    r = room(np.nan)
+    r[:40] = 3
+    r[100:112, 200:216] = 20
+    assert not far_islands(r).any()
