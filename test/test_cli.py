@@ -112,6 +112,20 @@ def test_run_gives_what_the_core_gives(bag, frames, tmp_path, capsys):
                          'dropped, first_frame: 1']
 
 
+def test_what_moves_is_written_where_the_matcher_can_tell(bag, frames, tmp_path):
+    out = tmp_path / 'out.mcap'
+    assert run('run', bag, *FAST, '-p', 'stereo.matcher:=joint', '--out', out,
+               '--topics', 'depth/moving') == 0
+    expected = truth(frames, **{'stereo.matcher': 'joint'})
+    found = results(out)['/depth/moving']
+    assert len(found) == len(expected) == COUNT - 1
+    for message, result, frame in zip(found, expected, frames[1:], strict=True):
+        assert convert.frame_key(message.header) == frame.key
+        assert (message.encoding, message.step) == ('mono8', message.width)
+        image = np.asarray(message.data).reshape(message.height, message.width)
+        np.testing.assert_array_equal(image, result.range_image.moving)
+
+
 def test_run_twice_gives_the_same_file(bag, tmp_path):
     for name in ('one.mcap', 'two.mcap'):
         assert run('run', bag, *FAST, '-p', 'baseline.length:=0.15', '--out', tmp_path / name) == 0

@@ -168,6 +168,41 @@ def test_pipeline_on_compressed_images_without_a_baseline(ros: Graph) -> None:
     assert set(statuses) == {f'pipeline: {stage}' for stage in STAGES}
 
 
+def rising(frame: Frame, i: int) -> Frame:
+    """Frame i with something textured beside the camera that rises by 4 px a frame."""
+    image = frame.image.copy()
+    place = slice(120 - 4 * i, 160 - 4 * i), slice(340, 380)
+    noise = np.random.default_rng(0).integers(0, 255, (10, 10), np.uint8)
+    image[place] = cv2.resize(noise, (40, 40), interpolation=cv2.INTER_CUBIC)
+    return Frame(frame.key, image)
+
+
+def test_what_moves_is_marked_and_unknown(ros: Graph) -> None:
+    client = ros.client
+    ros.start('pipeline', 'stereo.matcher:=joint', 'baseline.length:=0.15')
+    for topic in ('depth/moving', 'depth/image'):
+        client.subscribe(Image, topic)
+        client.linked(topic)
+    image = client.heard(Image, 'image', 'pipeline: frame_pairing')
+    chain = Chain(resolve({'stereo.matcher': 'joint', 'baseline.length': 0.15}))
+    for i, frame in enumerate(rising(f, i) for i, f in enumerate(frames()[:4])):
+        image.publish(mono8(frame.key.stamp, frame.image))
+        expected = chain.add_frame(frame)[0]
+        if not i:
+            continue
+        assert isinstance(expected, StageResults)
+        sent = client.stamped('depth/moving', frame.key.stamp)
+        assert (sent.encoding, sent.step) == ('mono8', 2 * HEIGHT)
+        moving = np.frombuffer(sent.data, np.uint8).reshape(HEIGHT, 2 * HEIGHT)
+        assert (moving != expected.range_image.moving).mean() < 1e-3
+        depth = floats(client.stamped('depth/image', frame.key.stamp))
+        assert np.isnan(depth[moving == 255]).all()
+    patch = np.zeros(moving.shape, bool)
+    patch[108:148, 340:380] = True
+    assert (moving[patch] == 255).mean() > 0.7
+    assert (moving[~patch] == 255).mean() < 0.02
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_every_node_ends_cleanly(ros: Graph, number: int) -> None:
     processes = [ros.start(name) for name in (*STAGES, 'pipeline')]

@@ -122,6 +122,7 @@ class RangeImage:
     range : float32 metres (steps between frames, if not `is_metric`): NaN unknown, +Inf
         confidently beyond the maximum, −Inf nearer than the minimum (REP-117)
     sigma : float32, one standard deviation of it, same unit; NaN where range is not finite
+    moving : uint8, 255 = moves by itself; None where the matcher cannot tell
     """
 
     key: FrameKey
@@ -129,6 +130,7 @@ class RangeImage:
     sigma: NDArray[np.float32]
     is_metric: bool
     quality: dict[str, Any] = field(default_factory=dict)
+    moving: Image8 | None = None
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ sphere, errs in other places than a dense flow does; only what both find is meas
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from .frames import UNSCALED, Frame, Image8, Reference, RelativePose
 from .inverse_range import NOTHING, _grid_angles, _polar_row, pose_sigmas
 from .jit import kernel, rows_in_parallel
-from .matching import UNKNOWN, Matcher, stereo_grid
+from .matching import UNKNOWN, Matcher, Parallax, stereo_grid
+from .moving import off_meridian
 from .refinement import REACH, JointRefinement, Refined
 from .sphere import polar_axes
 from .sweep import sweep
@@ -45,12 +46,14 @@ class Measurement:
     rho, sigma : where `agreed`; sigma is what it would be elsewhere too
     other : the second opinion by itself
     agreed : uint8, 1 where the second opinion is the same
+    moving : uint8 (H // 2, 2 * (H // 2)), 255 = leaves its meridian; None if that was not measured
     """
 
     rho: Map
     sigma: Map
     other: Map
     agreed: Image8
+    moving: Image8 | None = None
 
 
 def in_steps(pose: RelativePose) -> RelativePose:
@@ -74,6 +77,14 @@ def _nearness_rows(first: int, last: int, pixels: Map, theta: Map, pixel: np.flo
             before = np.sin(theta[j] - delta)
             known = pixels[i, j] != UNKNOWN and before > 1e-3 and abs(delta) < 1
             rho[i, j] = np.sin(delta) / (baseline * before) if known else np.float32(UNKNOWN)
+
+
+def _nearness(parallax: Parallax, grid: PolarGrid, baseline: float) -> Map:
+    rho = np.empty(grid.shape, np.float32)
+    rows_in_parallel(_nearness_rows, len(rho), parallax.pixels,
+                     np.asarray(grid.theta(), np.float32), np.float32(grid.pixel),
+                     np.float32(baseline), rho)
+    return rho
 
 
 def filled(rho: Map) -> Map:
@@ -159,8 +170,10 @@ class JointMatcher:
         axes = polar_axes(pairs[0][1].direction)
         view = np.asarray(resample(with_border(current.image),
                                    polar_map(grid, axes, current.image.shape)), np.uint8)
-        matched = self._matched(view, pairs[0], grid, axes)
+        parallax = self._parallax(view, pairs[0], grid, axes)
+        matched = _nearness(parallax, grid, pairs[0][1].baseline)
         refined = self._refined(view, grid, axes, pairs, filled(matched))
+        moving = off_meridian(parallax, refined.misfit, grid, axes, pairs[0][1], height)
         if self._sweeps:
             swept = [p for p in pairs if p[1].baseline <= _SWEPT * pairs[0][1].baseline]
             coarse, _ = sweep(view, grid, axes, swept)
@@ -168,19 +181,15 @@ class JointMatcher:
             tolerance = _tolerance([p.baseline for _, p in swept], grid.pixel)
         else:
             other, tolerance = matched, _tolerance_of_match(pairs[0][1].baseline, grid.pixel)
-        return self._on_sphere(refined, other, tolerance, grid, axes, pairs, height)
+        measured = self._on_sphere(refined, other, tolerance, grid, axes, pairs, height)
+        return replace(measured, moving=moving)
 
-    def _matched(self, view: Image8, nearest: tuple[Image8, RelativePose], grid: PolarGrid,
-                 axes: Floats) -> Map:
+    def _parallax(self, view: Image8, nearest: tuple[Image8, RelativePose], grid: PolarGrid,
+                  axes: Floats) -> Parallax:
         image, pose = nearest
         reference = np.asarray(resample(with_border(image), polar_map(
             grid, pose.rotation.T @ axes, image.shape)), np.uint8)
-        parallax = self._first(view, like(reference, view))
-        rho = np.empty(grid.shape, np.float32)
-        rows_in_parallel(_nearness_rows, len(rho), parallax.pixels,
-                         np.asarray(grid.theta(), np.float32), np.float32(grid.pixel),
-                         np.float32(pose.baseline), rho)
-        return rho
+        return self._first(view, like(reference, view))
 
     def _refined(self, view: Image8, grid: PolarGrid, axes: Floats,
                  pairs: Sequence[tuple[Image8, RelativePose]], start: Map) -> Refined:

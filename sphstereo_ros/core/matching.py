@@ -46,12 +46,15 @@ class Parallax:
     float32 at half the grid's size: pixel (i, j) has sigma[i // 2, j // 2].
 
     A matcher whose search ends at zero cannot say that a point is beyond all range: `signed` tells
-    that parallaxes about zero were searched on both sides.
+    that parallaxes about zero were searched on both sides. `across`, of sigma's size, is how far
+    the match lies off the meridian, px along the rows (0 where unknown); None where none was
+    searched for.
     """
 
     pixels: Pixels
     sigma: Pixels
     signed: bool
+    across: Pixels | None = None
 
 
 Matcher = Callable[[Image8, Image8], Parallax]
@@ -127,7 +130,9 @@ def flow_matcher(preset: str, finest_scale: int, smoothness: float, bounds: Boun
         sigma = _length(structure_sigma(current, bounds), _FORTH_AND_BACK * half)
         pixels = -along
         pixels[(loop > _LOOP) | (np.abs(across) > _ACROSS)] = UNKNOWN
-        return Parallax(pixels, sigma, signed=True)
+        off = np.where(loop > _LOOP, np.float32(0), across)
+        return Parallax(pixels, sigma, signed=True, across=np.asarray(cv2.resize(
+            off, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)))
 
     return match
 

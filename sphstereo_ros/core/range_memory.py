@@ -140,6 +140,12 @@ class RangeMemory:
         return Remembered(moved.rho, np.where(enough, moved.sigma, np.float32(NOTHING)),
                           moved.evidence)
 
+    def forget(self, where: NDArray[np.bool_]) -> None:
+        """Keep nothing of these pixels of the newest frame."""
+        if self._kept is not None:
+            self._kept.sigma[where] = NOTHING
+            self._kept.evidence[where] = 0
+
     def _fade(self, key: FrameKey) -> float:
         """What time alone takes of the evidence of one frame."""
         if self._key is None or self._seconds <= 0:

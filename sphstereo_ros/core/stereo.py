@@ -17,11 +17,13 @@ from .frames import (
     Reference,
     RelativePose,
 )
-from .inverse_range import InverseRange, fuse, inverse_range, published_range
+from .inverse_range import NOTHING, InverseRange, fuse, inverse_range, published_range
 from .islands import far_islands
 from .joint import JointMatcher
 from .matching import matcher, stereo_grid
+from .moving import moving_parts, under_floor
 from .range_memory import RangeMemory
+from .rotations import mount
 from .warp import aligned_pair
 
 
@@ -50,6 +52,8 @@ class SphericalStereo:
         for reference, current in pairwise(frames):  # the second time, there is a memory
             self.process(AlignedWindow(current, (Reference(reference, pose),)))
         self._memory = RangeMemory(self.config.stereo.memory)
+        nothing = np.zeros(noise.shape, np.float32)
+        under_floor(nothing, nothing, np.zeros(3))  # noise has no floor
 
     def process(self, window: AlignedWindow) -> RangeImage | Drop:
         """Range and sigma on the current frame's grid.
@@ -62,23 +66,30 @@ class SphericalStereo:
             return Drop('size_changed', 'the frames of a window differ in size')
         if len({r.pose.is_metric for r in window.references}) != 1:
             return Drop('mixed_scale', 'some baselines of a window are metric, others are not')
-        mask = self._mask_of(height)
+        mask, moving = self._mask_of(height), None
         if self._joint is not None:
-            estimate = self._remembered(self._joint, window, mask)
+            estimate, moving = self._remembered(self._joint, window, mask)
         else:
             estimate = fuse([self._measure(window.current, r) for r in window.references])
         r, sigma = published_range(estimate, self.config.range, window.is_metric, mask)
         if self._joint is not None and window.is_metric:
             hidden = far_islands(r)
             r[hidden] = sigma[hidden] = np.nan
-        return RangeImage(window.current.key, r, sigma, window.is_metric)
+        return RangeImage(window.current.key, r, sigma, window.is_metric, moving=moving)
 
     def _remembered(self, joint: JointMatcher, window: AlignedWindow,
-                    mask: Image8 | None) -> InverseRange:
+                    mask: Image8 | None) -> tuple[InverseRange, Image8]:
+        """What is known without what moves, and that."""
         measured = joint.measure(window.current, window.references)
         fused = self._memory.fused(window.current.key, window.references, measured,
                                    None if mask is None else mask != 0)
-        return InverseRange(fused.rho, fused.sigma, joint.signed)
+        down = -mount(self.config.camera).rotation[2]
+        wrong, moving = moving_parts(fused, measured, down)
+        if mask is not None:
+            moving[mask != 0] = 0
+        self._memory.forget(wrong)
+        fused.sigma[wrong] = NOTHING
+        return InverseRange(fused.rho, fused.sigma, joint.signed), moving
 
     def _measure(self, current: Frame, reference: Reference) -> InverseRange:
         height = current.image.shape[0]

@@ -23,6 +23,7 @@ class RangeOutputs:
         self._depth = shell.output(image, 'depth/image', large)
         self._relative = shell.output(image, 'depth/relative', large)
         self._sigma = shell.output(image, 'depth/sigma', large)
+        self._moving = shell.output(image, 'depth/moving', large)
         self._preview = shell.output(image, 'depth/preview', large)
         self._points = shell.output('sensor_msgs/msg/PointCloud2', 'points', large)
 
@@ -36,6 +37,9 @@ class RangeOutputs:
                 make, point_cloud(measured, window.current, self._shell.config)))
         else:
             self._relative.send(lambda: depth_message(make, key, measured.range))
+        moving = measured.moving
+        if moving is not None:
+            self._moving.send(lambda: image_message(make, key, moving))
         self._preview.send(lambda: image_message(make, key, colour_map(measured)))
         known = np.count_nonzero(~np.isnan(measured.range[::4, ::4])) * 16 / measured.range.size
         return {'metric': measured.is_metric, 'coverage': f'{known:.3f}', **measured.quality}

@@ -33,8 +33,8 @@ from sphstereo_ros.ros.images import read_mask
 from sphstereo_ros.ros.messages import SECOND
 
 TOPICS = ('/frames', '/pairs', '/pairs/stabilised', '/pairs/aligned', '/depth/image',
-          '/depth/sigma', '/depth/relative', '/depth/preview', '/points', '/odometry/visual',
-          '/diagnostics')
+          '/depth/sigma', '/depth/relative', '/depth/moving', '/depth/preview', '/points',
+          '/odometry/visual', '/diagnostics')
 DEFAULT_TOPICS = frozenset(TOPICS) - {'/frames'}  # pixels are large
 
 SAMPLES: dict[str, Callable[[Any], Any]] = {
@@ -177,6 +177,9 @@ class OfflineRun:
             outputs['/depth/sigma'] = lambda: depth_message(make, key, measured.sigma)
         else:
             outputs['/depth/relative'] = lambda: depth_message(make, key, measured.range)
+        moving = measured.moving
+        if moving is not None:
+            outputs['/depth/moving'] = lambda: image_message(make, key, moving)
         cloud = results.cloud
         if cloud is not None:
             outputs['/points'] = lambda: cloud_message(make, cloud)

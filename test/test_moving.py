@@ -1,0 +1,206 @@
+"""What moves: marked, and never called far; what is at rest is not marked."""
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from analytic_world import View, World, _noise, look, true_pose
+
+from sphstereo_ros.core.camera import Equirectangular
+from sphstereo_ros.core.config import resolve
+from sphstereo_ros.core.frames import AlignedWindow, Frame, FrameKey, RangeImage, Reference
+from sphstereo_ros.core.inverse_range import NOTHING
+from sphstereo_ros.core.matching import flow_matcher
+from sphstereo_ros.core.moving import cleaned, floor_plane, under_floor
+from sphstereo_ros.core.stereo import SphericalStereo
+
+HEIGHT, STEP, COUNT, PERIOD = 280, 0.28, 6, 33_333_333
+WORLD = World(posts=())
+DOWN = np.array([0.0, 1, 0])
+ABOVE, BESIDE, BELOW = (95, 400), (140, 420), (200, 420)  # rows and columns of a patch's centre
+
+
+@cache
+def still() -> tuple[View, ...]:
+    """Views of a camera that drives forward through a room at rest."""
+    return tuple(look(WORLD, (0, 0, STEP * (i - COUNT)), height=HEIGHT) for i in range(COUNT))
+
+
+def inside(at: tuple[float, float], size: int = 17) -> np.ndarray:
+    """Pixels of a square patch."""
+    v, u = np.mgrid[0:HEIGHT, 0:2 * HEIGHT]
+    return (np.abs(v - at[0]) < size) & (np.abs(u - at[1]) < size)
+
+
+def with_patch(view: View, at: tuple[float, float]) -> np.ndarray:
+    """The picture with a textured patch over it."""
+    v, u = np.mgrid[0:HEIGHT, 0:2 * HEIGHT].astype(float)
+    points = np.stack([v - at[0], u - at[1], 0 * v], -1)
+    grey = 128 + sum(weight * _noise(points / cell, seed) for seed, (cell, weight) in enumerate(
+        ((12.0, 150.0), (6.0, 100.0), (3.0, 50.0))))
+    return np.where(inside(at), np.clip(grey, 0, 255), view.image).astype(np.uint8)
+
+
+def ranged(at: tuple[float, float], speed: tuple[float, float], **parameters: object
+           ) -> tuple[RangeImage, np.ndarray, np.ndarray]:
+    """The last range image with a patch that ends at `at` and moves by `speed` (rows, columns) a
+    frame; where the patch is, and the range of the room.
+    """
+    stereo = SphericalStereo(resolve({'stereo.matcher': 'joint', 'baseline.source': 'odometry',
+                                      **parameters}))
+    frames, found = [], None
+    for i, view in enumerate(still()):
+        place = (at[0] + speed[0] * (i + 1 - COUNT), at[1] + speed[1] * (i + 1 - COUNT))
+        frames.append(Frame(FrameKey((i + 1) * PERIOD, 'camera_optical'),
+                            with_patch(view, place)))
+        references = tuple(Reference(frames[i - back], true_pose(still()[i - back], view))
+                           for back in (1, 4) if back <= i)
+        if references:
+            found = stereo.process(AlignedWindow(frames[i], references))
+    assert isinstance(found, RangeImage)
+    return found, inside(at), still()[-1].range
+
+
+def marked(found: RangeImage) -> np.ndarray:
+    assert found.moving is not None
+    assert (found.moving.shape, found.moving.dtype) == (found.range.shape, np.uint8)
+    assert set(np.unique(found.moving)) <= {0, 255}
+    return found.moving == 255
+
+
+@pytest.mark.parametrize(('at', 'speed'), [
+    (BESIDE, (3.0, 0.0)), (BESIDE, (-3.0, 0.0)),  # across the meridians, which are level here
+    (ABOVE, (0.0, -2.5)), (BESIDE, (0.0, -3.0))])  # backward along them
+def test_what_no_resting_point_could_do_is_marked_and_unknown(at, speed):
+    found, patch, exact = ranged(at, speed)
+    moves = marked(found)
+    assert moves[patch].mean() > 0.7
+    assert moves[~inside(at, 25)].mean() < 0.003
+    assert np.isnan(found.range[moves]).all()
+    assert np.isnan(found.sigma[moves]).all()
+    with np.errstate(invalid='ignore'):
+        assert not (found.range[patch] > 1.2 * exact[patch]).any()
+
+
+def test_a_room_at_rest_is_not_marked():
+    """A patch that moves as a point of the wall, too."""
+    found, _, exact = ranged((-100.0, -100.0), (0, 0))
+    assert marked(found).mean() < 0.001
+    assert np.isfinite(found.range).mean() > 0.7
+    known = np.isfinite(found.range)
+    assert np.median(np.abs(found.range / exact - 1)[known]) < 0.01
+
+
+def test_what_keeps_pace_under_the_horizon_is_not_called_far():
+    """No parallax at all: by itself it would be at infinity, which no floor lets be seen."""
+    found, patch, exact = ranged(BELOW, (0.0, 0.0))
+    assert marked(found)[patch].mean() > 0.7
+    assert marked(found)[~inside(BELOW, 25)].mean() < 0.003
+    assert not np.isposinf(found.range[patch]).any()
+    with np.errstate(invalid='ignore'):
+        assert not (found.range[patch] > 1.35 * exact[patch]).any()
+
+
+def test_block_matching_knows_the_floor_alone():
+    assert ranged(BESIDE, (3.0, 0.0), **{'stereo.matcher': 'joint_fast'})[0].moving is not None
+
+
+@pytest.mark.parametrize('matcher', ['hybrid', 'bm'])
+def test_pair_by_pair_cannot_tell(matcher):
+    stereo = SphericalStereo(resolve({'stereo.matcher': matcher}))
+    view, before = still()[1], still()[0]
+    found = stereo.process(AlignedWindow(Frame(FrameKey(1, ''), view.image), (
+        Reference(Frame(FrameKey(0, ''), before.image), true_pose(before, view)),)))
+    assert isinstance(found, RangeImage)
+    assert found.moving is None
+
+
+def test_the_vehicle_does_not_move():
+    mask = np.uint8(255) * inside(BELOW, 20)
+    stereo = SphericalStereo(resolve({'stereo.matcher': 'joint'}), mask)
+    frames = [Frame(FrameKey((i + 1) * PERIOD, ''), with_patch(v, BELOW))
+              for i, v in enumerate(still()[:4])]
+    for i in (1, 2, 3):
+        found = stereo.process(AlignedWindow(frames[i], (
+            Reference(frames[i - 1], true_pose(still()[i - 1], still()[i])),)))
+    assert isinstance(found, RangeImage)
+    assert not marked(found)[mask != 0].any()
+
+
+@pytest.mark.parametrize('shift', [0.0, 2.5, -4.0])
+def test_flow_says_how_far_it_leaves_the_meridian(shift):
+    rows, columns = np.mgrid[0:160, 0:160].astype(float)
+    now, then = (np.clip(128 + 150 * _noise(np.stack([r / 9, columns / 9, 0 * r], -1), 0), 0, 255)
+                 .astype(np.uint8) for r in (rows, rows + shift))
+    found = flow_matcher('fast', 1, 40.0, (0.1, 2.0))(now, then)
+    assert found.across is not None
+    assert found.across.shape == found.sigma.shape == (80, 80)
+    assert np.median(found.across[10:-10, 10:-10]) == pytest.approx(-shift, abs=0.15)
+
+
+# The floor
+
+def seen(height: float = 1.7, tilt: float = 0.0, rows: int = 192) -> tuple[
+        np.ndarray, np.ndarray, np.ndarray]:
+    """ρ, σ and bearings: a floor `height` metres down, inclined by `tilt` rad, out to 40 m."""
+    bearings = Equirectangular(rows, 2 * rows).bearings()
+    normal = np.array([np.sin(tilt), np.cos(tilt), 0]) / height
+    rho = bearings @ normal
+    known = rho > 1 / 40
+    return (np.where(known, rho, 0).astype(np.float32),
+            np.where(known, 0.02 * rho, NOTHING).astype(np.float32), bearings)
+
+
+@pytest.mark.parametrize(('height', 'tilt'), [(1.7, 0.0), (0.4, 0.1), (30.0, -0.2)])
+def test_the_floor_is_found_through_what_stands_on_it(height, tilt):
+    rho, sigma, bearings = seen(height, tilt)
+    rng = np.random.default_rng(1)
+    rho *= (1 + 0.01 * rng.normal(size=rho.shape)).astype(np.float32)
+    stands = (bearings[..., 0] > 0.2) & (bearings[..., 2] > 0)
+    rho[stands] *= 2
+    plane = floor_plane(rho, sigma, DOWN)
+    assert plane is not None
+    np.testing.assert_allclose(plane, [np.sin(tilt) / height, np.cos(tilt) / height, 0],
+                               atol=0.01 / height)
+    again = floor_plane(rho, sigma, DOWN)
+    assert again is not None
+    assert (again == plane).all()
+
+
+def test_where_there_is_no_floor_none_is_found():
+    rho, sigma, bearings = seen()
+    assert floor_plane(rho, np.full_like(sigma, NOTHING), DOWN) is None
+    assert floor_plane(np.full_like(rho, 0.2), np.full_like(sigma, 0.01), DOWN) is None  # a ball
+    assert floor_plane(rho, sigma, np.array([0.0, -1, 0])) is None  # upside down
+    steep, sigma_of_it, _ = seen(tilt=0.5)
+    assert floor_plane(steep, sigma_of_it, DOWN) is None  # a bank is no floor
+    pit = rho.copy()
+    pit[bearings[..., 2] > 0.25] /= 2  # a terrace with much beneath
+    assert floor_plane(pit, sigma, DOWN) is None
+
+
+def test_under_the_floor_is_what_lies_clearly_under_it():
+    rho, sigma, bearings = seen()
+    plane = np.array([0.0, 1 / 1.7, 0])
+    downward = bearings[..., 1] > 0.1
+    assert not under_floor(rho, sigma, plane).any()
+    lower, _, _ = seen(1.2 * 1.7)  # a kerb, a ditch
+    assert not under_floor(lower, np.float32(0.001) + 0 * sigma, plane).any()
+    falling = (bearings @ np.array([0, np.cos(0.045), -np.sin(0.045)]) / 1.7).astype(np.float32)
+    assert not under_floor(np.maximum(falling, 0), 0 * sigma, plane).any()
+    far = np.full_like(rho, 1 / 120)
+    assert (under_floor(far, 0 * sigma, plane)[downward] == 255).all()
+    assert not under_floor(far, 0 * sigma, plane)[bearings[..., 1] < 0.05].any()
+    assert not under_floor(far, 0.3 + 0 * sigma, plane).any()  # nothing is sure
+
+
+def test_specks_go_and_gaps_close_over_the_seam():
+    mask = np.zeros((60, 120), np.uint8)
+    mask[10, 20] = mask[30:32, 50:52] = 255
+    mask[20:40, -8:] = mask[20:40, :8] = 255
+    mask[29:31, :] = 0
+    out = cleaned(mask)
+    assert not out[:, 15:100].any()
+    assert (out[22:38, -5:] == 255).all()
+    assert (out[22:38, :5] == 255).all()
