@@ -22,6 +22,7 @@ from .islands import far_islands
 from .joint import JointMatcher
 from .matching import matcher, stereo_grid
 from .moving import moving_parts, under_floor
+from .planes import on_planes
 from .range_memory import RangeMemory
 from .rotations import mount
 from .warp import aligned_pair
@@ -89,7 +90,11 @@ class SphericalStereo:
             moving[mask != 0] = 0
         self._memory.forget(wrong)
         fused.sigma[wrong] = NOTHING
-        return InverseRange(fused.rho, fused.sigma, joint.signed), moving
+        believed = on_planes(fused.rho, fused.sigma, measured.rho) & ~wrong & (moving == 0)
+        if mask is not None:
+            believed &= mask == 0
+        return InverseRange(np.where(believed, measured.rho, fused.rho),
+                            np.where(believed, measured.sigma, fused.sigma), joint.signed), moving
 
     def _measure(self, current: Frame, reference: Reference) -> InverseRange:
         height = current.image.shape[0]
