@@ -55,6 +55,18 @@ class World:
         return np.clip(out, 0, 255)
 
 
+@dataclass(frozen=True)
+class Ball(World):
+    """A hollow sphere about the origin: seen from there, everything is `radius` metres away."""
+
+    radius: float = 3.0
+
+    def range(self, position: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """Distance from `position` (inside) to the sphere, along each unit ray (..., 3)."""
+        along = rays @ position
+        return np.sqrt(along**2 + self.radius**2 - position @ position) - along
+
+
 @cache
 def _lattice(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-0.5, 0.5, 64**3).astype(np.float32)

@@ -1,0 +1,162 @@
+"""Joint refinement against exact ranges: inside a sphere, everything is equally far."""
+from __future__ import annotations
+
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from analytic_world import Ball, World
+from polar_views import HEIGHT, PolarView, Vector, polar_view
+
+from sphstereo_ros.core.refinement import JointRefinement, Refined
+from sphstereo_ros.core.sphere import polar_bearings
+
+RADIUS = 3.0
+BALL = Ball(cell=0.27 * RADIUS, radius=RADIUS)
+TWO: tuple[Vector, ...] = ((0, 0, -0.3), (0, 0, -1.2))
+WINDOW = 9
+
+
+@cache
+def seen(positions: tuple[Vector, ...] = TWO, world: World = BALL,
+         reference_turn: Vector = (0, 0, 0)) -> PolarView:
+    return polar_view(world, positions, reference_turn=reference_turn)
+
+
+def refined(view: PolarView, start: np.ndarray, steps: int = 1,
+            pairs: list | None = None) -> Refined:
+    refinement = JointRefinement(view.image, view.grid, view.axes, pairs or view.pairs)
+    found = refinement.refined(start, WINDOW)
+    for _ in range(steps - 1):
+        found = refinement.refined(found.rho, WINDOW)
+    return found
+
+
+def errors(found: Refined, view: PolarView) -> np.ndarray:
+    """Relative errors outside the cones round both poles, with their sign."""
+    theta = view.theta()
+    return (found.rho / view.rho() - 1)[(theta > 15) & (theta < 165)]
+
+
+def off_by(view: PolarView, share: float) -> np.ndarray:
+    return (view.rho() * (1 + share)).astype(np.float32)
+
+
+def bearing_pixels(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column of an equirectangular image where points (..., 3) are seen."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    return ((np.arctan2(y, np.hypot(x, z)) / np.pi + 0.5) * HEIGHT,
+            (np.arctan2(x, z) / np.pi + 1) * HEIGHT)
+
+
+def changed(view: PolarView, **images: np.ndarray) -> list:
+    """The pairs with some images replaced: n0 is that of the nearest reference."""
+    return [(images.get(f'n{n}', image), pose) for n, (image, pose) in enumerate(view.pairs)]
+
+
+@pytest.mark.parametrize('share', [-0.2, -0.05, 0.05, 0.2])
+def test_it_converges_from_a_start_that_is_off(share):
+    view = seen()
+    once, thrice = (errors(refined(view, off_by(view, share), n), view) for n in (1, 3))
+    assert np.median(np.abs(once)) < 0.25 * abs(share)
+    assert np.median(np.abs(thrice)) < 0.003
+    assert abs(np.median(thrice)) < 0.001
+    assert (np.abs(thrice) < 0.02).mean() > 0.95
+
+
+@pytest.mark.parametrize('positions', [
+    ((0.3, 0, 0),), ((0, -0.3, 0),), ((0, 0, 0.3),), ((0.17, 0.1, -0.22),),
+    ((0, 0, -0.3), (0.21, 0, -1.18)), ((0, 0, -0.3), (0, 0.9, -0.8), (-0.9, 0, -0.8))], ids=str)
+def test_every_direction_of_motion_and_references_aside_of_it(positions):
+    view = seen(positions, BALL, (0.1, 0.2, -0.1))
+    found = errors(refined(view, off_by(view, 0.05), 2), view)
+    # 0.3 m alone: a pixel is a fifth of the range
+    assert np.median(np.abs(found)) < (0.015 if len(positions) == 1 else 0.004)
+    assert abs(np.median(found)) < 0.002
+
+
+def test_what_is_right_stays():
+    view = seen()
+    found = errors(refined(view, view.rho()), view)
+    assert np.median(np.abs(found)) < 0.003
+    assert abs(np.median(found)) < 0.0005
+
+
+def test_the_long_reference_sharpens_what_the_short_one_finds():
+    view = seen()
+    alone, both = (np.median(np.abs(errors(refined(view, view.rho(), pairs=pairs), view)))
+                   for pairs in (view.pairs[:1], view.pairs))
+    assert both < 0.4 * alone
+
+
+def test_a_reference_that_is_too_far_away_for_the_range_takes_no_part():
+    view = seen(((0, 0, -0.3), (0, 0, -2.4)))  # 0.8 of the range
+    noise = np.random.default_rng(0).integers(0, 256, view.pairs[0][0].shape, np.uint8)
+    without = refined(view, view.rho(), pairs=view.pairs[:1])
+    for pairs in (view.pairs, changed(view, n1=noise)):
+        got = refined(view, view.rho(), pairs=pairs)
+        same = np.isclose(got.rho, without.rho, rtol=1e-5)
+        assert same.mean() > 0.999
+
+
+@pytest.mark.parametrize('which', [0, 1, 3])
+def test_a_reference_that_shows_something_else_is_left_out(which):
+    """Something stands before a part of its view."""
+    view = seen(tuple((0.0, 0.0, -0.3 * n) for n in (1, 2, 3, 4)))
+    other = polar_view(Ball(cell=0.5, radius=1.1), ((0, 0, 0.3),)).current.image
+    image, pose = view.pairs[which]
+    hidden = image.copy()
+    hidden[40:120, 20:100] = other[40:120, 20:100]
+    points = RADIUS * polar_bearings(view.grid.theta()[None], view.grid.azimuth()[:, None],
+                                     view.axes) - pose.position
+    v, u = bearing_pixels(points)
+    behind = (v > 45) & (v < 115) & (u > 25) & (u < 95)
+    assert behind.mean() > 0.05
+    clean, got = (np.abs(refined(view, off_by(view, 0.03), 2, pairs).rho * RADIUS - 1)[behind]
+                  for pairs in (view.pairs, changed(view, **{f'n{which}': hidden})))
+    assert np.median(got) < 2 * np.median(clean)
+    assert (got > 0.03).mean() < (clean > 0.03).mean() + 0.02
+
+
+@pytest.mark.parametrize(('gain', 'offset'), [(0.6, 40), (1.3, -20), (1.0, 40)])
+def test_exposure_of_the_references_changes_nothing(gain, offset):
+    view = seen()
+    narrow = PolarView(cv2.convertScaleAbs(view.image, alpha=0.5, beta=64), view.grid, view.axes,
+                       changed(view, n0=cv2.convertScaleAbs(view.pairs[0][0], alpha=0.5 * gain,
+                                                            beta=64 + offset - 10),
+                               n1=cv2.convertScaleAbs(view.pairs[1][0], alpha=0.5, beta=64)),
+                       view.current, view.world)
+    found = errors(refined(narrow, off_by(view, 0.1), 3), view)
+    assert np.median(np.abs(found)) < 0.005
+    assert abs(np.median(found)) < 0.002
+
+
+def test_a_blank_view_tells_nothing():
+    view = seen()
+    blank = PolarView(np.full_like(view.image, 90), view.grid, view.axes, [
+        (np.full_like(i, 100), p) for i, p in view.pairs], view.current, view.world)
+    found = refined(blank, off_by(view, 0.1))
+    np.testing.assert_array_equal(found.information, 0)
+    np.testing.assert_allclose(found.rho, off_by(view, 0.1), rtol=1e-6)
+
+
+def test_information_adds_up_and_falls_with_contrast():
+    view = seen()
+    both, *each = (refined(view, view.rho(), pairs=pairs).information
+                   for pairs in (view.pairs, view.pairs[:1], view.pairs[1:]))
+    clear = np.abs(view.theta() - 90) < 60
+    assert np.median((each[0] + each[1])[clear] / both[clear]) == pytest.approx(1, abs=0.01)
+    faint = PolarView(cv2.convertScaleAbs(view.image, alpha=0.2, beta=90), view.grid, view.axes, [
+        (cv2.convertScaleAbs(i, alpha=0.2, beta=90), p) for i, p in view.pairs],
+        view.current, view.world)
+    less = refined(faint, view.rho()).information
+    assert np.median(less[clear]) < 0.2 * np.median(both[clear])
+
+
+def test_misfit_tells_what_does_not_fit():
+    view = seen()
+    right, wrong = (refined(view, off_by(view, share)).misfit for share in (0.0, 1.5))
+    clear = np.abs(view.theta() - 90) < 60
+    assert np.median(right[clear]) < 10  # noise of one level each, and resampling
+    assert np.median(wrong[clear]) > 10 * np.median(right[clear])
