@@ -76,6 +76,13 @@ def test_every_direction_of_motion_and_references_aside_of_it(positions):
     assert abs(np.median(found)) < 0.002
 
 
+def test_a_reference_far_aside_converges_as_fast():
+    view = seen(((0, 0, -0.1), (0.9, 0.7, 0)))
+    found = np.abs(errors(refined(view, off_by(view, 0.05)), view))
+    assert np.median(found) < 0.013
+    assert (found < 0.03).mean() > 0.8
+
+
 def test_what_is_right_stays():
     view = seen()
     found = errors(refined(view, view.rho()), view)
@@ -119,14 +126,22 @@ def test_a_reference_that_shows_something_else_is_left_out(which):
     assert (got > 0.03).mean() < (clean > 0.03).mean() + 0.02
 
 
+def test_what_does_not_fit_has_no_say_at_all():
+    view = seen()
+    noise = np.random.default_rng(0).integers(0, 256, view.pairs[1][0].shape, np.uint8)
+    start = off_by(view, 0.01)
+    alone = refined(view, start, pairs=view.pairs[:1]).rho
+    got = refined(view, start, pairs=changed(view, n1=noise)).rho
+    clear = np.abs(view.theta() - 90) < 60
+    assert np.isclose(got, alone, rtol=1e-6)[clear].mean() > 0.9
+
+
 @pytest.mark.parametrize(('gain', 'offset'), [(0.6, 40), (1.3, -20), (1.0, 40)])
 def test_exposure_of_the_references_changes_nothing(gain, offset):
     view = seen()
     narrow = PolarView(cv2.convertScaleAbs(view.image, alpha=0.5, beta=64), view.grid, view.axes,
-                       changed(view, n0=cv2.convertScaleAbs(view.pairs[0][0], alpha=0.5 * gain,
-                                                            beta=64 + offset - 10),
-                               n1=cv2.convertScaleAbs(view.pairs[1][0], alpha=0.5, beta=64)),
-                       view.current, view.world)
+                       [(cv2.convertScaleAbs(image, alpha=0.5 * gain, beta=54 + offset), pose)
+                        for image, pose in view.pairs], view.current, view.world)
     found = errors(refined(narrow, off_by(view, 0.1), 3), view)
     assert np.median(np.abs(found)) < 0.005
     assert abs(np.median(found)) < 0.002

@@ -10,8 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from polar_views import PolarView, Vector, polar_view
 
-from sphstereo_ros.core.sweep import _census_rows, _different_bits, levels, sweep
-from sphstereo_ros.core.warp import PolarGrid
+from sphstereo_ros.core.sweep import (
+    _across_rows,
+    _along_rows,
+    _census_rows,
+    _different_bits,
+    _scale_rows,
+    levels,
+    sweep,
+)
+from sphstereo_ros.core.warp import PolarGrid, polar_map, resample, with_border
 
 BASELINES = st.lists(st.floats(0.02, 30.0), min_size=1, max_size=10)
 HEIGHTS = st.integers(16, 2048)
@@ -93,6 +101,75 @@ def test_different_bits_are_counted(a, b):
     assert _different_bits(np.uint32(a), np.uint32(b)) == (a ^ b).bit_count()
 
 
+def test_costs_are_scaled_to_bytes_and_the_volume_is_emptied():
+    volume = np.array([[[0, 10, 600]]], np.uint16)
+    cost = np.empty(volume.shape, np.uint8)
+    _scale_rows(0, 1, volume, 0.5, cost)
+    np.testing.assert_array_equal(cost, [[[0, 5, 255]]])
+    assert not volume.any()
+
+
+# --- paths through the image
+
+
+def path_costs(cost: np.ndarray, image: np.ndarray, way: tuple[int, int]) -> np.ndarray:
+    """Hirschmüller's recursion along one way (rows, columns), which does not leave the image.
+
+    A path that would start outside goes on along the border.
+    """
+    rows, columns, count = cost.shape
+    out = np.zeros(cost.shape, int)
+    for n, m in np.ndindex(rows, columns):
+        i, j = (n if way[0] >= 0 else rows - 1 - n), (m if way[1] >= 0 else columns - 1 - m)
+        ip, jp = i - way[0], min(max(j - way[1], 0), columns - 1)
+        first = not 0 <= ip < rows if way[0] else jp == j
+        before = np.zeros(count, int) if first else out[ip, jp]
+        ip, jp = (i, j) if first and not way[0] else (min(max(ip, 0), rows - 1), jp)
+        step = abs(int(image[i, j]) - int(image[ip, jp]))
+        jump = max(40, 200 * 8 // (8 + step))
+        beside = np.pad(before, 1, constant_values=10**6)
+        out[i, j] = cost[i, j] - before.min() + np.minimum.reduce(
+            [before, beside[:-2] + 10, beside[2:] + 10, np.full(count, before.min() + jump)])
+    return out
+
+
+@pytest.mark.parametrize('levels_', [3, 7])
+def test_all_paths_are_summed(levels_):
+    rng = np.random.default_rng(levels_)
+    cost = rng.integers(0, 250, (11, 9, levels_), np.uint8)
+    image = rng.integers(0, 255, (11, 9), np.uint8)
+    total = np.zeros(cost.shape, np.uint16)
+    _along_rows(0, 11, cost, image, total)
+    np.testing.assert_array_equal(total, sum(
+        path_costs(cost, image, way) for way in ((0, 1), (0, -1))))
+    for slant in (0, 1, -1):
+        total[:] = 0
+        _across_rows(0, 9, cost, image, slant, total)
+        np.testing.assert_array_equal(total, sum(
+            path_costs(cost, image, way) for way in ((1, slant), (-1, -slant))))
+
+
+def test_paths_carry_the_range_over_what_is_blank():
+    """From all sides, in noisy pictures: a patch has the range of its rim."""
+    view, rng = seen(Ball(cell=0.8)), np.random.default_rng(0)
+
+    def patched(image: np.ndarray) -> np.ndarray:
+        out = image.astype(float)
+        out[74:86, 68:92] = 128  # nearly the same place in every view
+        return np.clip(out + 5 * rng.normal(size=out.shape), 0, 255).astype(np.uint8)
+
+    def on_grid(image: np.ndarray) -> np.ndarray:
+        return resample(with_border(image), polar_map(view.grid, view.axes, image.shape))
+
+    pairs = [(patched(image), pose) for image, pose in view.pairs]
+    found, _ = sweep(on_grid(patched(view.current.image)), view.grid, view.axes, pairs)
+    place = np.zeros(view.current.image.shape, np.uint8)
+    place[74:86, 68:92] = 255
+    inside = on_grid(place)[::2, ::2] > 0
+    assert inside.sum() > 60
+    assert (np.abs(found * 3.0 - 1) < 0.1)[inside].mean() > 0.4
+
+
 # --- the sweep
 
 
@@ -147,10 +224,13 @@ def test_a_longer_reference_makes_it_finer():
 
 
 def test_what_is_too_near_for_the_long_reference_the_short_one_decides():
-    ball = Ball(cell=0.3, radius=1.0)
-    view = seen(ball, ((0, 0, -0.2), (0, 0, -0.8)))
-    blind = [*view.pairs[:1], (np.full_like(view.pairs[1][0], 90), view.pairs[1][1])]
-    found, _ = sweep(view.image, view.grid, view.axes, blind)
+    """Two long ones agree on another range: from inside, a larger sphere looks alike."""
+    positions = ((0, 0, -0.3), (0, 0, -0.88), (0, 0, -0.9))
+    view, decoys = (seen(Ball(cell=0.27 * radius, radius=radius), positions)
+                    for radius in (1.0, 1.25))
+    assert np.abs(view.image.astype(int) - decoys.image).mean() < 2
+    pairs = [*view.pairs[:1], *decoys.pairs[1:]]
+    found, _ = sweep(view.image, view.grid, view.axes, pairs)
     middle = np.abs(view.theta(coarse(view)) - 90) < 60
     assert np.median(found[middle]) == pytest.approx(1.0, abs=0.1)
 
