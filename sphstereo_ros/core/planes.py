@@ -15,7 +15,7 @@ from .warp import Map
 
 Floats = NDArray[np.float64]
 
-_STEP = 2  # px: every n-th pixel and row takes part
+_ROWS = 240  # every n-th pixel and row takes part, so that about so many rows do
 _WINDOWS = 48  # windows from pole to pole, half overlapping
 _LEAST = 0.25  # of a window must be known,
 _CENTRED = 0.2  # and on all sides: their centre lies that near to the window's, of its width
@@ -37,8 +37,9 @@ def on_planes(rho: Map, sigma: Map, measured: Map) -> NDArray[np.bool_]:
     (H, 2H), true only where nothing is known yet
 
     """
-    half = max(len(rho) // _WINDOWS // _STEP, 2)
-    plane, flat = _planes(rho[::_STEP, ::_STEP], sigma[::_STEP, ::_STEP], half)
+    step = max(len(rho) // _ROWS, 1)
+    half = max(len(rho) // _WINDOWS // step, 2)
+    plane, flat = _planes(rho[::step, ::step], sigma[::step, ::step], half)
     size = rho.shape[::-1]
     expected = cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
     believed = cv2.resize(flat.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
