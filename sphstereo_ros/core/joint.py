@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .frames import UNSCALED, Frame, Image8, Reference, RelativePose
 from .inverse_range import NOTHING, _grid_angles, _polar_row, pose_sigmas
-from .jit import kernel, rows_in_parallel
+from .jit import fast_kernel, kernel, rows_in_parallel
 from .matching import UNKNOWN, Matcher, Parallax, stereo_grid
 from .moving import off_meridian
 from .refinement import REACH, JointRefinement, Refined
@@ -67,23 +67,31 @@ def in_steps(pose: RelativePose) -> RelativePose:
     return RelativePose(pose.rotation, pose.position / UNSCALED, covariance)
 
 
-@kernel
-def _nearness_rows(first: int, last: int, pixels: Map, theta: Map, pixel: np.float32,
-                   baseline: np.float32, rho: Map) -> None:  # pragma: no cover - compiled
+@fast_kernel
+def _nearness_rows(first: int, last: int, pixels: Map, cos_theta: Map, sin_theta: Map,
+                   pixel: np.float32, per_baseline: np.float32,
+                   rho: Map) -> None:  # pragma: no cover - compiled
     """ρ = sin δ / (b sin θ1), or UNKNOWN."""
+    one = np.float32(1)
     for i in range(first, last):
-        for j in range(theta.size):
+        for j in range(cos_theta.size):
             delta = pixels[i, j] * pixel
-            before = np.sin(theta[j] - delta)
-            known = pixels[i, j] != UNKNOWN and before > 1e-3 and abs(delta) < 1
-            rho[i, j] = np.sin(delta) / (baseline * before) if known else np.float32(UNKNOWN)
+            d2 = min(delta * delta, one)
+            # sin δ to 2e-6 up to 1 rad
+            sin_d = delta * (one - d2 * np.float32(1 / 6) * (one - d2 * np.float32(1 / 20) * (
+                one - d2 * np.float32(1 / 42))))
+            cos_d = np.sqrt(max(one - sin_d * sin_d, np.float32(0)))
+            before = sin_theta[j] * cos_d - cos_theta[j] * sin_d  # sin θ1
+            known = (pixels[i, j] != UNKNOWN) & (before > np.float32(1e-3)) & (d2 < one)
+            found = sin_d * per_baseline / max(before, np.float32(1e-3))
+            rho[i, j] = found if known else np.float32(UNKNOWN)
 
 
 def _nearness(parallax: Parallax, grid: PolarGrid, baseline: float) -> Map:
-    rho = np.empty(grid.shape, np.float32)
-    rows_in_parallel(_nearness_rows, len(rho), parallax.pixels,
-                     np.asarray(grid.theta(), np.float32), np.float32(grid.pixel),
-                     np.float32(baseline), rho)
+    rho, theta = np.empty(grid.shape, np.float32), grid.theta()
+    rows_in_parallel(_nearness_rows, len(rho), parallax.pixels, np.cos(theta).astype(np.float32),
+                     np.sin(theta).astype(np.float32), np.float32(grid.pixel),
+                     np.float32(1 / baseline), rho)
     return rho
 
 

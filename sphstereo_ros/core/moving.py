@@ -145,7 +145,7 @@ def floor_plane(rho: Map, sigma: Map, down: Floats) -> Floats | None:
 def _seen_downward(rho: Map, sigma: Map,
                    down: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """Bearings (N, 3), ρ, σ and solid angle of some of the points under the camera."""
-    step = max(len(rho) // 60, 1)
+    step = max(len(rho) // 48, 1)
     lat_cos, lat_sin, lon_cos, lon_sin = _grid_angles(len(rho))
     c, s = lat_cos[::step, None], lat_sin[::step, None]
     cl, sl = lon_cos[None, ::step], lon_sin[None, ::step]

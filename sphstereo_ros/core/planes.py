@@ -15,7 +15,7 @@ from .warp import Map
 
 Floats = NDArray[np.float64]
 
-_ROWS = 240  # every n-th pixel and row takes part, so that about so many rows do
+_ROWS = 160  # every n-th pixel and row takes part, so that about so many rows do
 _WINDOWS = 48  # windows from pole to pole, half overlapping
 _LEAST = 0.25  # of a window must be known,
 _CENTRED = 0.2  # and on all sides: their centre lies that near to the window's, of its width

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .frames import FrameKey, Image8, Reference, RelativePose
 from .history import PoseHistory
 from .inverse_range import NOTHING, _grid_angles
-from .jit import kernel, rows_in_parallel
+from .jit import fast_kernel, kernel, rows_in_parallel
 from .joint import Measurement, in_steps
 from .warp import Map, _arctan2
 
@@ -36,41 +36,57 @@ class Remembered:
     evidence: Map
 
 
-@kernel
-def _move(old_rho: Map, old_sigma: Map, old_evidence: Map, cos_lat: Map, sin_lat: Map,
-          cos_lon: Map, sin_lon: Map, pose: Map, rho: Map, sigma: Map,
-          evidence: Map) -> None:  # pragma: no cover - compiled
-    """Every known pixel where the current camera sees it; what is nearest hides the rest."""
+@fast_kernel
+def _place_rows(first: int, last: int, old_rho: Map, cos_lat: Map, sin_lat: Map, cos_lon: Map,
+                sin_lon: Map, pose: Map, column: Map, row: Map,
+                scale: Map) -> None:  # pragma: no cover - compiled
+    """Where the current camera sees every pixel, and its inverse range as a multiple."""
     height, width = old_rho.shape
     per_u, per_v = np.float32(width / (2 * np.pi)), np.float32(height / np.pi)
-    half, least = np.float32(0.5), np.float32(0.2)
-    for i in range(height):
+    left, top = np.float32(0.5 * width - 0.5), np.float32(0.5 * height - 0.5)
+    for i in range(first, last):
         for j in range(width):
-            if old_sigma[i, j] >= NOTHING:
-                continue
             r = old_rho[i, j]
             a, b, c = cos_lat[i] * sin_lon[j], -sin_lat[i], cos_lat[i] * cos_lon[j]
             x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + r * pose[0, 3]
             y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + r * pose[1, 3]
             z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + r * pose[2, 3]
-            per_n = np.float32(1) / np.sqrt(x * x + y * y + z * z)
-            moved = r * per_n
-            u = _arctan2(x, z) * per_u + np.float32(width // 2) - half
-            v = _arctan2(y, np.sqrt(x * x + z * z)) * per_v + np.float32(0.5 * height) - half
-            u0, v0 = np.int32(np.floor(u)), np.int32(np.floor(v))
+            level = x * x + z * z
+            scale[i, j] = np.float32(1) / np.sqrt(level + y * y)
+            column[i, j] = _arctan2(x, z) * per_u + left
+            row[i, j] = _arctan2(y, np.sqrt(level)) * per_v + top
+
+
+@kernel
+def _splat(old_rho: Map, old_sigma: Map, old_evidence: Map, at_column: Map, at_row: Map,
+           scale: Map, rho: Map, sigma: Map,
+           evidence: Map) -> None:  # pragma: no cover - compiled
+    """Every known pixel to where it is seen; what is nearest hides the rest."""
+    height, width = old_rho.shape
+    least = np.float32(0.2)
+    for i in range(height):
+        for j in range(width):
+            if old_sigma[i, j] >= NOTHING:
+                continue
+            per_n = scale[i, j]
+            moved, spread = old_rho[i, j] * per_n, old_sigma[i, j] * per_n * per_n
+            u, v = at_column[i, j] + 1, at_row[i, j] + 1  # not negative
+            u0, v0 = np.int32(u), np.int32(v)
             fu, fv = u - np.float32(u0), v - np.float32(v0)
             for dv in range(2):
-                row = v0 + dv
+                row = v0 + dv - 1
                 if row < 0 or row >= height:
                     continue
                 wv = fv if dv else 1 - fv
                 for du in range(2):
                     if wv * (fu if du else 1 - fu) < least:
                         continue
-                    column = (u0 + du) % width
+                    column = u0 + du - 1
+                    column = column + width if column < 0 else column
+                    column = column - width if column >= width else column
                     if sigma[row, column] >= NOTHING or moved > rho[row, column]:
                         rho[row, column] = moved
-                        sigma[row, column] = old_sigma[i, j] * per_n * per_n
+                        sigma[row, column] = spread
                         evidence[row, column] = old_evidence[i, j]
 
 
@@ -168,8 +184,12 @@ class RangeMemory:
             self._frames = 0
             return empty
         placed = np.column_stack([pose.rotation, pose.position]).astype(np.float32)
-        _move(self._kept.rho, self._kept.sigma, self._kept.evidence, *_grid_angles(shape[0]),
-              placed, empty.rho, empty.sigma, empty.evidence)
+        kept = self._kept
+        column, row, scale = (np.empty(shape, np.float32) for _ in range(3))
+        rows_in_parallel(_place_rows, shape[0], kept.rho, *_grid_angles(shape[0]), placed, column,
+                         row, scale)
+        _splat(kept.rho, kept.sigma, kept.evidence, column, row, scale, empty.rho, empty.sigma,
+               empty.evidence)
         return empty
 
     def _pose_of_kept(self, key: FrameKey) -> RelativePose | None:
