@@ -36,6 +36,8 @@ _SLACK = 1.5  # px of the nearest pair by which refinement may move what was mat
 # independent, and no match is better than a share of a pixel.
 _DEPENDENT, _FLOOR = 4.0, 0.17
 _WINDOWS = {'joint': (9, 9), 'joint_fast': (9,)}
+# Light: how far round about, of half a turn; grey levels; percentile that differs by a share.
+_LIGHT, _DARK, _MOSTLY, _ALIKE = 1 / 30, 8.0, 90, 0.08
 _CELL, _SPREADS = 8, (1.0, 6.0)  # px, cells: how what was not matched is filled for a start
 
 
@@ -197,7 +199,8 @@ class JointMatcher:
         image, pose = nearest
         reference = np.asarray(resample(with_border(image), polar_map(
             grid, pose.rotation.T @ axes, image.shape)), np.uint8)
-        return self._first(view, like(reference, view))
+        reference, view = in_one_light(reference, view)
+        return self._first(view, reference)
 
     def _refined(self, view: Image8, grid: PolarGrid, axes: Floats,
                  pairs: Sequence[tuple[Image8, RelativePose]], start: Map) -> Refined:
@@ -235,8 +238,28 @@ def _tolerance_of_match(baseline: float, pixel: float) -> Map:
     return np.array([[baseline, 1e9, _SLACK * pixel / baseline, 0.0]], np.float32).T.copy()
 
 
-def like(image: Image8, model: Image8) -> Image8:
-    """The image with the contrast and brightness of `model`, where they differ by much."""
+def in_one_light(image: Image8, model: Image8) -> tuple[Image8, Image8]:
+    """Both images as if taken in the same light; of (H, W) uint8, nearly aligned.
+
+    The image gets the contrast and brightness of `model`, where they differ by much. Where the
+    light differs from place to place (a rolling shutter under lamps that flicker, two lenses),
+    both lose what changes slowly: to make one as bright as the other round about would print the
+    other's shades on what is blank.
+    """
+    alike = _like(image, model)
+    reach = _LIGHT * min(image.shape) / _CELL
+    size = (image.shape[1] // _CELL, image.shape[0] // _CELL)
+    slow = [cv2.GaussianBlur(cv2.resize(i, size, interpolation=cv2.INTER_AREA), (0, 0), reach)
+            for i in (alike, model)]
+    there, here = (s.astype(np.float32) + _DARK for s in slow)
+    if float(np.percentile(np.abs(np.log(there / here)), _MOSTLY)) < _ALIKE:
+        return alike, model
+    quick = [cv2.addWeighted(i, 1.0, cv2.resize(s, i.shape[::-1]), -1.0, 128.0)
+             for i, s in zip((alike, model), slow, strict=True)]
+    return np.asarray(quick[0], np.uint8), np.asarray(quick[1], np.uint8)
+
+
+def _like(image: Image8, model: Image8) -> Image8:
     (mean, spread), (wanted, wanted_spread) = (
         (float(m[0, 0]), float(s[0, 0])) for m, s in
         (cv2.meanStdDev(i[::4, ::4]) for i in (image, model)))

@@ -22,7 +22,7 @@ from .warp import Map, _arctan2
 _MOST = 6.0  # evidence
 _CONTRADICTED, _UNCONFIRMED, _UNSUPPORTED = 2.0, 1.0, 0.3  # what a frame takes away of it
 _AGREES, _SAME = 3.0, 0.02  # standard deviations, or share of the inverse range
-_OTHER = 0.05
+_OTHER, _CONFIRMS = 0.05, 0.3  # shares of it
 _GROWTH = 1.25  # of sigma from frame to frame: errors of consecutive frames are much alike
 _PUBLISHED = 2.0  # evidence that is enough
 
@@ -107,12 +107,16 @@ def _update_rows(first: int, last: int, new_rho: Map, new_sigma: Map, other: Map
             old, s = rho[i, j], sigma[i, j] * np.float32(_GROWTH)
             allowed = max(_AGREES * np.sqrt(s * s + spread * spread), _SAME * old)
             same = abs(measured - old) < allowed
+            before = s
             level = evidence[i, j]
             if same:
                 w, w_new = 1 / (s * s), 1 / (spread * spread)
                 rho[i, j] = (w * old + w_new * measured) / (w + w_new)
                 s = np.float32(1) / np.sqrt(w + w_new)
-                level += np.float32(1) if sure else -np.float32(max(_UNSUPPORTED, fade))
+                # What could be anything contradicts nothing, but confirms nothing either.
+                told = sure and abs(measured - old) < max(np.float32(_CONFIRMS) * old,
+                                                          np.float32(3) * before)
+                level += np.float32(1) if told else -np.float32(max(_UNSUPPORTED, fade))
             elif sure:
                 level -= np.float32(_CONTRADICTED)
                 if level <= 0 or measured > old:  # what is nearer counts at once
