@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from analytic_world import Ball, World
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from polar_views import PolarView, Vector, polar_view
 
@@ -54,6 +54,7 @@ def pixels_off(view: PolarView) -> np.ndarray:
 # --- levels
 
 
+@settings(deadline=None)
 @given(BASELINES, HEIGHTS)
 def test_levels_rise_from_beyond_infinity_and_are_never_too_many(baselines, height):
     found = levels(baselines, np.pi / height)
@@ -64,6 +65,7 @@ def test_levels_rise_from_beyond_infinity_and_are_never_too_many(baselines, heig
     assert np.array_equal(found, levels(baselines[::-1], np.pi / height))
 
 
+@settings(deadline=None)
 @given(BASELINES, HEIGHTS)
 def test_steps_of_parallax_are_even_and_fine_for_every_baseline_that_takes_part(baselines, height):
     pixel = np.pi / height
@@ -74,6 +76,7 @@ def test_steps_of_parallax_are_even_and_fine_for_every_baseline_that_takes_part(
         assert max(taking_part) * step == pytest.approx(allowed * pixel, rel=1e-6)
 
 
+@settings(deadline=None)
 @given(st.floats(0.02, 30.0), st.integers(16, 960))
 def test_levels_of_one_baseline_reach_to_the_nearest_that_matters(baseline, height):
     """To 0.3 m, or to half of the baseline, unless there would be too many."""
@@ -98,6 +101,7 @@ def test_census_has_a_bit_for_every_brighter_neighbour():
     np.testing.assert_array_equal(got, wanted)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**24 - 1), st.integers(0, 2**24 - 1))
 def test_different_bits_are_counted(a, b):
     assert _different_bits(np.uint32(a), np.uint32(b)) == (a ^ b).bit_count()

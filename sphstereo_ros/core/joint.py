@@ -266,5 +266,5 @@ def _like(image: Image8, model: Image8) -> Image8:
     gain = min(max(wanted_spread / max(spread, 1e-3), 0.3), 3.0)
     if abs(np.log(gain)) < 0.05 and abs(mean - wanted) < 3:
         return image
-    return np.asarray(cv2.convertScaleAbs(image, alpha=gain, beta=max(wanted - gain * mean, 0)),
-                      np.uint8)
+    table = np.clip(gain * (np.arange(256) - mean) + wanted, 0, 255).round().astype(np.uint8)
+    return np.asarray(cv2.LUT(image, table), np.uint8)

@@ -197,7 +197,7 @@ class RangeMemory:
         return empty
 
     def _pose_of_kept(self, key: FrameKey) -> RelativePose | None:
-        if self._key is None or self._seconds <= 0 or key <= self._key or (
+        if self._key is None or key <= self._key or (
                 key.frame_id != self._key.frame_id
                 or (key.stamp - self._key.stamp) * 1e-9 > self._seconds):
             return None
