@@ -11,8 +11,10 @@ from sphstereo_ros.core.camera import Equirectangular
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import AlignedWindow, Frame, FrameKey, RangeImage, Reference
 from sphstereo_ros.core.inverse_range import NOTHING
+from sphstereo_ros.core.joint import Measurement
 from sphstereo_ros.core.matching import flow_matcher
-from sphstereo_ros.core.moving import cleaned, floor_plane, under_floor
+from sphstereo_ros.core.moving import cleaned, floor_plane, moving_parts, under_floor
+from sphstereo_ros.core.range_memory import Remembered
 from sphstereo_ros.core.stereo import SphericalStereo
 
 HEIGHT, STEP, COUNT, PERIOD = 280, 0.28, 6, 33_333_333
@@ -193,6 +195,24 @@ def test_under_the_floor_is_what_lies_clearly_under_it():
     assert (under_floor(far, 0 * sigma, plane)[downward] == 255).all()
     assert not under_floor(far, 0 * sigma, plane)[bearings[..., 1] < 0.05].any()
     assert not under_floor(far, 0.3 + 0 * sigma, plane).any()  # nothing is sure
+
+
+def test_a_speck_under_the_floor_is_wrong_but_does_not_move():
+    """A mirror image, an error of the match."""
+    rho, sigma, _ = seen()
+    known = Remembered(rho.copy(), sigma.copy(), np.ones_like(rho))
+    known.rho[140, 100] = 1 / 100
+    known.sigma[140, 100] = 1e-3
+    new = Measurement(rho, sigma, rho, np.ones(rho.shape, np.uint8))
+    wrong, moving = moving_parts(known, new, DOWN)
+    assert np.argwhere(wrong).tolist() == [[140, 100]]
+    assert not moving.any()
+    new.rho[130:150, 90:110] = 1 / 100
+    wrong, moving = moving_parts(known, new, DOWN)
+    assert (moving[130:150, 90:110] == 255).all()
+    assert wrong[moving == 255].all()
+    new.agreed[:] = 0
+    assert not moving_parts(known, new, DOWN)[1].any()
 
 
 def test_specks_go_and_gaps_close_over_the_seam():
