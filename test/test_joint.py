@@ -105,11 +105,11 @@ def test_ranges_lie_on_their_pixels(method, turn, height):
 
 
 @pytest.mark.parametrize('height', [1, 2, 3, 97, 480, 960, 961])
-def test_the_grid_halves_twice_and_is_hardly_larger_than_the_frame(height):
+def test_the_grid_can_be_halved_and_is_hardly_larger_than_the_frame(height):
     grid = stereo_grid(height)
-    assert grid.height % 4 == 0
-    assert height <= grid.height < height + 4
-    assert all(n % 4 == 0 for n in grid.shape)
+    assert grid.height % 8 == 0
+    assert height <= grid.height < height + 8
+    assert all(n % 8 == 0 for n in grid.shape)
 
 
 @pytest.mark.parametrize('method', METHODS)

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from polar_views import PolarView, Vector, polar_view
 
+from sphstereo_ros.core.frames import RelativePose
 from sphstereo_ros.core.sphere import polar_bearings
 from sphstereo_ros.core.sweep import (
     _across_rows,
@@ -19,6 +20,7 @@ from sphstereo_ros.core.sweep import (
     _different_bits,
     _scale_rows,
     levels,
+    reduction,
     sweep,
 )
 from sphstereo_ros.core.warp import PolarGrid
@@ -279,3 +281,25 @@ def test_where_nothing_can_be_told_there_is_still_a_value(images):
     assert step == pytest.approx(level[1] - level[0])
     assert found.min() >= level[0] - 1e-6
     assert found.max() <= level[-1] + 1e-6
+
+
+@pytest.mark.parametrize('height', [480, 1200, 1208, 2400, 2408, 8192])
+def test_large_grids_are_shrunk_to_what_fits_into_memory(height):
+    by = reduction(height)
+    assert by in (2, 4, 8)
+    assert height / by <= 600 or by == 8
+    assert height <= 1200 or by > 2
+
+
+def test_the_number_of_threads_does_not_matter(monkeypatch):
+    rng = np.random.default_rng(5)
+    image = rng.integers(0, 255, (256, 512), np.uint8)
+    grid, axes = PolarGrid(256, 8, 8), np.eye(3)
+    view = rng.integers(0, 255, grid.shape, np.uint8)
+    pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -0.28]))
+    results = []
+    for threads in (1, 2, 5):
+        monkeypatch.setattr('sphstereo_ros.core.jit._threads', lambda threads=threads: threads)
+        results.append(sweep(view, grid, axes, [(image, pose)])[0])
+    np.testing.assert_array_equal(results[0], results[1])
+    np.testing.assert_array_equal(results[0], results[2])

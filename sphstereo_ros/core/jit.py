@@ -54,7 +54,8 @@ def _work_off(pieces: deque[tuple[int, int]], function: Callable[..., Any],
         function(first, last, *args)
 
 
-def rows_in_parallel(function: Callable[..., Any], rows: int, *args: Any) -> None:
+def rows_in_parallel(function: Callable[..., Any], rows: int, *args: Any,
+                     pieces: int = 0) -> None:
     """Call `function(first, last, *args)` for consecutive ranges that cover `rows` rows.
 
     The calling thread works too, and waits only for what others have begun: where the other cores
@@ -65,16 +66,18 @@ def rows_in_parallel(function: Callable[..., Any], rows: int, *args: Any) -> Non
     function : a kernel that releases the interpreter lock and writes only its own rows
     rows : number of rows
     args : passed on
+    pieces : number of ranges, where the result depends on it; 0 = as suits this machine
 
     """
-    count = min(_threads() * _PIECES_PER_THREAD, rows // _LEAST_ROWS) if _threads() > 1 else 1
+    suited = min(_threads() * _PIECES_PER_THREAD, rows // _LEAST_ROWS) if _threads() > 1 else 1
+    count = min(pieces, rows) or suited
     if count < 2:
         function(0, rows, *args)
         return
-    pieces = deque(pairwise(rows * i // count for i in range(count + 1)))
-    jobs = [_pool(_threads() - 1).submit(_work_off, pieces, function, args)
-            for _ in range(_threads() - 1)]
-    _work_off(pieces, function, args)
+    waiting = deque(pairwise(rows * i // count for i in range(count + 1)))
+    helpers = _threads() - 1
+    jobs = [_pool(helpers).submit(_work_off, waiting, function, args) for _ in range(helpers)]
+    _work_off(waiting, function, args)
     for job in jobs:
         if not job.cancel():
             job.result()

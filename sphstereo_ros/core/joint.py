@@ -22,7 +22,7 @@ from .matching import UNKNOWN, Matcher, Parallax, stereo_grid
 from .moving import off_meridian
 from .refinement import REACH, JointRefinement, Refined
 from .sphere import polar_axes
-from .sweep import sweep
+from .sweep import reduction, sweep
 from .warp import Map, PolarGrid, polar_map, resample, with_border
 
 Floats = NDArray[np.float64]
@@ -34,6 +34,7 @@ _AGREES, _LEVELS = 0.05, 0.75  # of the inverse range, or so many pixels at half
 _SLACK = 1.5  # px of the nearest pair by which refinement may move what was matched
 # The error model, fitted to the tuning scenes: differences in grey within a window are not
 # independent, and no match is better than a share of a pixel.
+_MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
 _DEPENDENT, _FLOOR = 4.0, 0.17
 _WINDOWS = {'joint': (9, 9), 'joint_fast': (9,)}
 # Light: how far round about, of half a turn; grey levels; percentile that differs by a share.
@@ -113,7 +114,7 @@ def filled(rho: Map) -> Map:
 
 @kernel
 def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map, sin_lon: Map,
-                  axes: Map, at_pole: Map, rho: Map, information: Map, other: Map,
+                  axes: Map, at_pole: Map, rho: Map, information: Map, misfit: Map, other: Map,
                   baselines: Map, pose: Map, tolerance: Map, out: Map, sigma_out: Map,
                   other_out: Map, agreed: Image8) -> None:  # pragma: no cover - compiled
     """Sample the polar grid; σ and agreement of every pixel.
@@ -154,7 +155,8 @@ def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Ma
                     pixels = tolerance[2, n]
                     break
             allowed = max(tolerance[3, 0] * abs(value), pixels)
-            agreed[i, j] = np.uint8(abs(value - second) < allowed)
+            agreed[i, j] = np.uint8((abs(value - second) < allowed)
+                                     & (misfit[rn, cn] < np.float32(_MISFIT)))
 
 
 class JointMatcher:
@@ -188,7 +190,8 @@ class JointMatcher:
             swept = [p for p in pairs if p[1].baseline <= _SWEPT * pairs[0][1].baseline]
             coarse, _ = sweep(view, grid, axes, swept)
             other = cv2.resize(coarse, grid.shape[::-1], interpolation=cv2.INTER_LINEAR)
-            tolerance = _tolerance([p.baseline for _, p in swept], grid.pixel)
+            tolerance = _tolerance([p.baseline for _, p in swept],
+                                   reduction(height) * grid.pixel)
         else:
             other, tolerance = matched, _tolerance_of_match(pairs[0][1].baseline, grid.pixel)
         measured = self._on_sphere(refined, other, tolerance, grid, axes, pairs, height)
@@ -221,16 +224,17 @@ class JointMatcher:
         baselines = np.array([p.baseline for _, p in pairs], np.float32)
         rows_in_parallel(_measure_rows, height, *_grid_angles(height),
                          np.ascontiguousarray(axes, np.float32), at_pole, refined.rho,
-                         refined.information, other, baselines, poses, tolerance, rho, sigma,
-                         second, agreed)
+                         refined.information, refined.misfit, other, baselines, poses, tolerance,
+                         rho, sigma, second, agreed)
         return Measurement(rho, sigma, second, agreed)
 
 
 def _tolerance(baselines: Sequence[float], pixel: float) -> Map:
-    """How far the sweep may be off, (4, N), longest baseline first: baseline, the most of baseline
-    over range to which it holds, 1/m; and in the last row the share of the inverse range.
+    """How far the sweep, of that `pixel` (rad), may be off, (4, N), longest baseline first:
+    baseline, the most of baseline over range to which it holds, 1/m; and in the last row the share
+    of the inverse range.
     """
-    rows = [(b, 0.6, _LEVELS * 2 * pixel / b, _AGREES) for b in sorted(baselines, reverse=True)]
+    rows = [(b, 0.6, _LEVELS * pixel / b, _AGREES) for b in sorted(baselines, reverse=True)]
     return np.array(rows, np.float32).T.copy()
 
 

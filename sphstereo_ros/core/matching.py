@@ -27,7 +27,7 @@ Bounds = tuple[float, float]
 # Pixels round an aligned pair that need not be matched: they are there for windows to see.
 MARGIN = 8
 
-_HALVINGS = 4  # how much coarser a grid gets at most: its height can be divided by that
+_HALVINGS = 8  # how much coarser a grid gets at most: its height can be divided by that
 
 UNKNOWN = -1e5  # more than a turn at any size
 

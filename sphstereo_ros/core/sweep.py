@@ -33,6 +33,8 @@ _REACH = 0.6  # baseline over range up to which a reference takes part: it looks
 _UNSEEN = 20  # cost of a level for a reference that takes no part
 _CONTRAST, _CONTRAST_LIMIT = 4, 12  # eighths of cost a grey level, and the most of it
 _BLUR = 15
+_LARGE = 1200  # rows: a larger grid is shrunk by more than half
+_BANDS = 16  # of columns, for paths across the rows: the same on every machine
 # Penalties for a change by one level, and by more: less, from _JUMP to _EDGE, where grey changes.
 _STEP, _JUMP, _EDGE, _EDGE_GREY = 10, 200, 40, 8
 _FREE = 60000  # beyond the first and the last level
@@ -238,9 +240,14 @@ def _winner_rows(first: int, last: int, total: Volume, level: Map,
             out[i, j] = value
 
 
-def _half(image: Image8) -> Image8:
-    rows, columns = image.shape  # of an odd number, what is left over is spread evenly
-    return np.asarray(cv2.resize(image, (columns // 2, rows // 2), interpolation=cv2.INTER_AREA))
+def reduction(height: int) -> int:
+    """By how much a grid of `height` rows is shrunk: to half, or to what fits into memory."""
+    return 2 if height <= _LARGE else 4 if height <= 2 * _LARGE else 8
+
+
+def _shrunk(image: Image8, by: int) -> Image8:
+    rows, columns = image.shape  # what is left over is spread evenly
+    return np.asarray(cv2.resize(image, (columns // by, rows // by), interpolation=cv2.INTER_AREA))
 
 
 def _polar_table(grid: PolarGrid, level: Floats, baseline: float) -> Map:
@@ -252,42 +259,45 @@ def _polar_table(grid: PolarGrid, level: Floats, baseline: float) -> Map:
 
 def sweep(current: Image8, grid: PolarGrid, axes: Floats,
           references: Sequence[tuple[Image8, RelativePose]]) -> tuple[Map, float]:
-    """Inverse range on the current view's polar grid at half size.
+    """Inverse range on the current view's polar grid, shrunk by `reduction` (to half as a rule).
 
     Parameters
     ----------
     current : the current view on `grid` at full size
-    grid, axes : that grid (even height and margins) and its axes (3, 3), current optical frame
+    grid, axes : that grid (height and margins multiples of the reduction) and its axes (3, 3),
+        current optical frame
     references : equirectangular images (H, 2H) and their poses, nearest first
 
     Returns
     -------
-    float32 of half of grid.shape, 1/m, and the step between its far levels, 1/m. Every pixel has
-    a value: how far it can be trusted, the caller has to find out.
+    float32 of the shrunk grid.shape, 1/m, and the step between its far levels, 1/m. Every pixel
+    has a value: how far it can be trusted, the caller has to find out.
 
     """
-    half = PolarGrid(grid.height // 2, grid.margin // 2, grid.wrap // 2)
-    view = _view(_half(current))
+    by = reduction(grid.height)
+    half = PolarGrid(grid.height // by, grid.margin // by, grid.wrap // by)
+    view = _view(_shrunk(current, by))
     baselines = [pose.baseline for _, pose in references]
     level = levels(baselines, half.pixel)
     total = np.zeros((*view.image.shape, level.size), np.uint16)
     for image, pose in references:
-        _add_reference(view, half, axes, image, pose, level, pose is references[0][1], total)
+        small = _shrunk(image, by)
+        _add_reference(view, half, axes, small, pose, level, pose is references[0][1], total)
     cost = np.empty(total.shape, np.uint8)
     rows_in_parallel(_scale_rows, len(total), total, 2.0 / len(references), cost)
     rows_in_parallel(_along_rows, len(total), cost, view.image, total)
     for slant in (0, 1, -1):
-        rows_in_parallel(_across_rows, total.shape[1], cost, view.image, slant, total)
+        rows_in_parallel(_across_rows, total.shape[1], cost, view.image, slant, total,
+                         pieces=_BANDS)
     out = np.empty(view.image.shape, np.float32)
     rows_in_parallel(_winner_rows, len(total), total, level.astype(np.float32), out)
     return cv2.medianBlur(out, 3), float(level[1] - level[0])
 
 
-def _add_reference(view: _View, half: PolarGrid, axes: Floats, image: Image8, pose: RelativePose,
+def _add_reference(view: _View, half: PolarGrid, axes: Floats, small: Image8, pose: RelativePose,
                    level: Floats, nearest: bool, total: Volume) -> None:
     own_grid = PolarGrid(half.height, _MARGIN, _MARGIN)
     own_axes = polar_axes(pose.direction)
-    small = _half(image)
     reference = _view(np.asarray(resample(with_border(small), polar_map(
         own_grid, pose.rotation.T @ own_axes, small.shape)), np.uint8))
     row, column = np.empty(total.shape[:2], np.float32), np.empty(total.shape[:2], np.float32)
