@@ -365,3 +365,18 @@ def test_every_frame_has_one_outcome(events: list[tuple[str, int, str]], source:
             assert all(s < o.current.key.stamp for s in stamps)
             assert {r.frame.key.frame_id for r in o.references} == {o.current.key.frame_id}
             assert o.is_metric == (source != 'fixed')
+
+
+def test_at_most_so_many_windows_a_second_and_all_frames_are_references() -> None:
+    p = pairer(pairing__intervals=(1, 2), baseline__length=0.28, pairing__max_rate=15.0)
+    outcomes = [p.add_frame(frame(i * STEP)) for i in range(9)]
+    assert [o[0].cause if isinstance(o[0], Drop) else 'window' for o in outcomes] == [
+        'first_frame', 'window', *['rate_limit', 'window'] * 3, 'rate_limit']
+    assert window(outcomes[3]) == (3 * STEP, [(2 * STEP, 0.28), (STEP, 0.56)])
+
+
+def test_without_a_limit_every_frame_has_a_window() -> None:
+    p = pairer(pairing__intervals=(1,), baseline__length=0.28)
+    assert cause(p.add_frame(frame(0))) == 'first_frame'
+    for i in range(1, 5):
+        assert window(p.add_frame(frame(i)))[0] == i

@@ -140,6 +140,8 @@ class _Run:
                         moving=truth.moving)
         if isinstance(outcome, Drop):  # nothing is known of the whole sphere
             self._score.drops[outcome.cause] += 1
+            if outcome.cause == 'rate_limit':  # by the parameters, not a failure
+                return
             height = self._chain.config.stereo.working_height or len(truth.image)
             unknown = np.full((height, 2 * height), np.nan, np.float32)
             self._score.scores.append(score(unknown))

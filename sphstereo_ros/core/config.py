@@ -119,6 +119,9 @@ class PairingConfig:
                                       low=0.0, high=1000.0)
     max_frames: int = _p('pairing.max_frames', 100, 'how many frames back pairing.baselines may '
                          'reach; fewer where so many take more than 512 MB', low=1, high=1000)
+    max_rate: float = _p('pairing.max_rate', 0.0, 'windows a second at most, where later stages '
+                         'cannot keep up; frames between serve as references; 0 = every frame',
+                         unit='Hz', low=0.0, high=1000.0)
     max_gap: float = _p('pairing.max_gap', 1.0, 'a longer gap between frames, or stamps that run '
                         'backward, empty the buffer', unit='s', low=0.001, high=3600.0)
 

@@ -12,6 +12,7 @@ from sphstereo_ros.core.frames import Drop, Frame, PairedWindow, Reference, Rela
 from sphstereo_ros.core.motion import ImuSample, OdometrySample, TwistSample
 
 MAX_WAITING = 10
+_EARLY = 0.9  # of the least time between windows: stamps jitter
 # Memory for the frames among which a wanted baseline is looked for.
 MAX_BYTES = 512 * 2**20
 
@@ -51,6 +52,7 @@ class Pairer:
         self._waiting: deque[Frame] = deque()
         self._frames: deque[Frame] = deque()
         self._last: Frame | None = None
+        self._paired: int | None = None
         self.configure(config)
 
     def configure(self, config: Config) -> None:
@@ -141,7 +143,9 @@ class Pairer:
         return None
 
     def _window(self, frame: Frame) -> Outcome:
-        """Pair `frame` with earlier ones, nearest first."""
+        """Pair `frame` with earlier ones, nearest first, unless the last window is too recent."""
+        if self._is_early(frame):
+            return Drop('rate_limit', 'kept as a reference')
         found = self._by_distance(frame) if by_distance(self._config) \
             else self._by_interval(frame)
         drops = [pose for _, pose in found if isinstance(pose, Drop)]
@@ -149,8 +153,14 @@ class Pairer:
                       if isinstance(pose, RelativePose)]
         if references:
             references.sort(key=lambda r: (r.pose.baseline, -r.frame.key.stamp))
+            self._paired = frame.key.stamp
             return PairedWindow(frame, tuple(references))
         return drops[0] if drops else Drop('no_reference', 'no earlier frame is far enough back')
+
+    def _is_early(self, frame: Frame) -> bool:
+        rate, last = self._config.max_rate, self._paired
+        return (rate > 0 and last is not None
+                and 0 < frame.key.stamp - last < _EARLY * SECOND / rate)
 
     def _by_interval(self, frame: Frame) -> list[tuple[Frame, RelativePose | Drop]]:
         return [self._prior(frame, back) for back in sorted(set(self._config.intervals))
