@@ -31,7 +31,6 @@ Floats = NDArray[np.float64]
 # change faster than one a pixel on a road.
 _SWEPT = 5.0
 _AGREES, _LEVELS = 0.05, 0.75  # of the inverse range, or so many pixels at half size
-_WITHIN = 0.5  # or so many standard deviations
 _SLACK = 1.5  # px of the nearest pair by which refinement may move what was matched
 # The error model, fitted to the tuning scenes: differences in grey within a window are not
 # independent, and no match is better than a share of a pixel.
@@ -155,8 +154,7 @@ def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Ma
                 if abs(value) * tolerance[0, n] < tolerance[1, n]:
                     pixels = tolerance[2, n]
                     break
-            allowed = max(max(tolerance[3, 0] * abs(value), pixels),
-                          np.float32(_WITHIN) * sigma_out[i, j])
+            allowed = max(tolerance[3, 0] * abs(value), pixels)
             agreed[i, j] = np.uint8((abs(value - second) < allowed)
                                      & (misfit[rn, cn] < np.float32(_MISFIT)))
 
