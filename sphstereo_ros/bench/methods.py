@@ -30,8 +30,9 @@ def _file(name: str) -> Mapping[str, object]:
 
 
 # What is compared by default: the paper's method, block matching at its best, one reference, the
-# full window, and what a small computer runs live. A matcher's name is the full window with it.
-COMPARED = ('paper', 'sgbm_true_pose', 'one_reference', 'default', 'live')
+# full window, and what a small computer runs live, fast or checked. A matcher's name is the full window with it.
+COMPARED = ('paper', 'sgbm_true_pose', 'one_reference', 'default', 'live',
+            'live_checked')
 METHODS = (*COMPARED, *MATCHERS)
 
 
@@ -43,8 +44,8 @@ def method(name: str, overrides: Mapping[str, object] | None = None) -> Method:
         return Method({**ONE_REFERENCE, 'stereo.matcher': 'sgbm'}, true_pose=True)
     if name == 'one_reference':
         return Method(ONE_REFERENCE, remembers=True)
-    if name == 'live':
-        return Method(_file('config/live.yaml'), remembers=True)
+    if name in {'live', 'live_checked'}:
+        return Method(_file(f'config/{name}.yaml'), remembers=True)
     if name in MATCHERS:
         return Method({'stereo.matcher': name}, remembers=True)
     return Method(overrides or {}, remembers=True)
