@@ -30,7 +30,8 @@ def _file(name: str) -> Mapping[str, object]:
 
 
 # What is compared by default: the paper's method, block matching at its best, one reference, the
-# full window, and what a small computer runs live, fast or checked. A matcher's name is the full window with it.
+# full window, and what a small computer runs live, fast or checked. A matcher's name is the full
+# window with it.
 COMPARED = ('paper', 'sgbm_true_pose', 'one_reference', 'default', 'live',
             'live_checked')
 METHODS = (*COMPARED, *MATCHERS)
