@@ -31,7 +31,7 @@ from sphstereo_ros.ros.conversions import decode_frame, read_cloud, read_depth
 
 from .live import last_lines
 from .processes import STAGES, Processes, numbers, private_domain, shipped
-from .scoring import average, compare
+from .scoring import BANDS, average, compare
 
 TRUTH = '/ground_truth/range'
 IMAGE, DEPTH, CLOUD, PREVIEW = '/image/compressed', '/depth/image', '/points', '/depth/preview'
@@ -239,11 +239,12 @@ def table(summary: Mapping[str, Any]) -> str:
     accuracy = summary['accuracy']
     lines += ['', f'range against the truth ({accuracy["frames"]} frames)',
               f'{"":10}{"coverage %":>12}{"median error %":>16}{"over 10 % wrong, %":>20}']
-    for band, scores in accuracy.items():
-        if isinstance(scores, Mapping):
-            values = [float('nan') if scores[key] is None else scores[key]
-                      for key in ('coverage', 'median', 'bad')]
-            lines.append(f'{band + " m":10}{values[0]:12.1f}{values[1]:16.2f}{values[2]:20.1f}')
+    for low, high in BANDS:
+        scores = accuracy[f'{low:g}-{high:g}']
+        values = [float('nan') if scores[key] is None else scores[key]
+                  for key in ('coverage', 'median', 'bad')]
+        lines.append(f'{f"{low:g}-{high:g} m":10}{values[0]:12.1f}{values[1]:16.2f}'
+                     f'{values[2]:20.1f}')
     return '\n'.join(lines)
 
 
