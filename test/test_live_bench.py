@@ -279,3 +279,19 @@ def test_live_bench_measures_the_nodes() -> None:
     assert result['restart']['node'] == 'pipeline'
     assert math.isfinite(result['restart']['subscribed_to_depth_s'])
     assert result['exit_statuses'] == {'pipeline': 0}
+
+
+def test_the_table_of_the_demonstration_has_the_bands() -> None:
+    pytest.importorskip('rclpy')
+    from sphstereo_ros.bench import demo
+    from sphstereo_ros.bench.scoring import average, compare
+
+    truth = np.full((32, 64), 5.0)
+    figures = {'frames_in': 20, 'depth_out': 19, 'clouds_out': 19, 'rate_in_hz': 6.0,
+               'rate_depth_hz': 6.0, 'latency_ms': {'p50': 60.0, 'p95': None}, 'drops': {}}
+    accuracy = {'frames': 1, **average([compare(1.02 * truth, truth)])}
+    text = demo.table({'slow': figures, 'live': figures, 'accuracy': accuracy})
+    band = next(line for line in text.splitlines() if line.startswith('0-10 m'))
+    assert band.split()[2:] == ['100.0', '2.00', '0.0']
+    assert '0-10 m' not in demo.table({'slow': figures, 'live': figures,
+                                       'accuracy': demo.score({}, {})})

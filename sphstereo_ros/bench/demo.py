@@ -239,7 +239,7 @@ def table(summary: Mapping[str, Any]) -> str:
     accuracy = summary['accuracy']
     lines += ['', f'range against the truth ({accuracy["frames"]} frames)',
               f'{"":10}{"coverage %":>12}{"median error %":>16}{"over 10 % wrong, %":>20}']
-    for low, high in BANDS:
+    for low, high in BANDS if accuracy['frames'] else ():
         scores = accuracy[f'{low:g}-{high:g}']
         values = [float('nan') if scores[key] is None else scores[key]
                   for key in ('coverage', 'median', 'bad')]
