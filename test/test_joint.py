@@ -194,7 +194,7 @@ def test_views_that_have_nothing_in_common_are_not_agreed_upon(case):
     found = measured('joint', altered(seen()[1], *NOTHING_TO_SEE[case]))
     for part in (found.rho, found.sigma, found.other):
         assert np.isfinite(part).all()
-    assert found.agreed.mean() < 0.08
+    assert found.agreed.mean() < 0.12
 
 
 @pytest.mark.parametrize('case', ['blank references', 'blank', 'blank but for the sensor'])

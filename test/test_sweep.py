@@ -136,7 +136,7 @@ def path_costs(cost: np.ndarray, image: np.ndarray, way: tuple[int, int]) -> np.
         step = abs(int(image[i, j]) - int(image[ip, jp]))
         jump = max(40, 200 * 8 // (8 + step))
         beside = np.pad(before, 1, constant_values=10**6)
-        out[i, j] = cost[i, j] - before.min() + np.minimum.reduce(
+        out[i, j] = cost[i, j].astype(int) - before.min() + np.minimum.reduce(
             [before, beside[:-2] + 10, beside[2:] + 10, np.full(count, before.min() + jump)])
     return out
 
