@@ -31,7 +31,7 @@ def test_the_ground_is_completed_by_what_was_measured(height, share):
     rho, inside = ground(height)
     sigma = gappy(rho, share)
     open_ = inside & (sigma >= NOTHING)
-    found = on_planes(rho, sigma, rho)
+    found = on_planes(rho, sigma, rho, rho)
     assert not found[sigma < NOTHING].any()
     assert found[open_].mean() > 0.9
 
@@ -40,13 +40,13 @@ def test_the_ground_is_completed_by_what_was_measured(height, share):
 def test_a_measurement_off_the_plane_is_not_believed(factor):
     rho, inside = ground(2.0)
     sigma = gappy(rho, 0.6)
-    assert on_planes(rho, sigma, np.float32(factor) * rho)[inside].mean() < 0.005
+    assert on_planes(rho, sigma, np.float32(factor) * rho, rho)[inside].mean() < 0.005
 
 
 def test_across_the_seam_as_anywhere():
     rho, inside = ground(2.0)
     sigma = gappy(rho, 0.6)
-    found = on_planes(rho, sigma, rho)
+    found = on_planes(rho, sigma, rho, rho)
     seam = np.zeros(rho.shape, bool)
     seam[:, :6] = seam[:, -6:] = True
     assert found[seam & inside & (sigma >= NOTHING)].mean() > 0.9
@@ -57,7 +57,7 @@ def test_nothing_is_continued_beyond_the_rim_of_what_is_known():
     rho, _ = ground(2.0)
     sigma = gappy(rho, 0.8)
     sigma[:, :HEIGHT] = NOTHING
-    found = on_planes(rho, sigma, rho)
+    found = on_planes(rho, sigma, rho, rho)
     assert not found[:, 12:HEIGHT - 12].any()
 
 
@@ -65,6 +65,16 @@ def test_a_step_is_no_plane():
     rho = np.full((HEIGHT, 2 * HEIGHT), 0.2, np.float32)
     rho[:, HEIGHT:] = 0.5
     sigma = gappy(rho, 0.6)
-    found = on_planes(rho, sigma, rho)
+    found = on_planes(rho, sigma, rho, rho)
     assert not found[20:-20, HEIGHT - 1:HEIGHT + 1].any()
     assert found[20:-20, 40:HEIGHT - 40][sigma[20:-20, 40:HEIGHT - 40] >= NOTHING].mean() > 0.9
+
+
+def test_what_may_stand_before_the_plane_is_not_given_its_range():
+    rho, inside = ground(2.0)
+    sigma = gappy(rho, 0.6)
+    nearer = rho.copy()
+    nearer[:, HEIGHT:] *= 2
+    found = on_planes(rho, sigma, rho, nearer)
+    assert not found[:, HEIGHT:].any()
+    assert found[:, :HEIGHT][inside[:, :HEIGHT] & (sigma[:, :HEIGHT] >= NOTHING)].mean() > 0.9

@@ -22,6 +22,7 @@ from .matching import UNKNOWN, Matcher, Parallax, stereo_grid
 from .moving import off_meridian
 from .refinement import REACH, JointRefinement, Refined
 from .sphere import polar_axes
+from .sweep import REACH as SWEEP_REACH
 from .sweep import reduction, sweep
 from .warp import Map, PolarGrid, polar_map, resample, with_border
 
@@ -234,7 +235,8 @@ def _tolerance(baselines: Sequence[float], pixel: float) -> Map:
     baseline, the most of baseline over range to which it holds, 1/m; and in the last row the share
     of the inverse range.
     """
-    rows = [(b, 0.6, _LEVELS * pixel / b, _AGREES) for b in sorted(baselines, reverse=True)]
+    rows = [(b, SWEEP_REACH, _LEVELS * pixel / b, _AGREES)
+            for b in sorted(baselines, reverse=True)]
     return np.array(rows, np.float32).T.copy()
 
 

@@ -21,16 +21,19 @@ _LEAST = 0.25  # of a window must be known,
 _CENTRED = 0.2  # and on all sides: their centre lies that near to the window's, of its width
 _FLAT = 0.05  # relative deviation from the plane, of what is known
 _ON_PLANE = 0.06  # and of a measurement that lies on it
+_NEARER = 1.5  # times its inverse range: a second opinion that outweighs a plane
 _FARTHEST = 1 / 60  # 1/m (or 1/step): beyond, planes are too small to tell
 
 
-def on_planes(rho: Map, sigma: Map, measured: Map) -> NDArray[np.bool_]:
+def on_planes(rho: Map, sigma: Map, measured: Map, other: Map) -> NDArray[np.bool_]:
     """Which measurements lie on the plane of what is known round about.
 
     Parameters
     ----------
     rho, sigma : (H, 2H) what is known, 1/m; sigma is NOTHING elsewhere
     measured : (H, 2H) 1/m, everywhere
+    other : (H, 2H) 1/m, a second opinion; where it is much nearer, the plane may be what lies
+        behind something, and nothing is believed
 
     Returns
     -------
@@ -43,7 +46,7 @@ def on_planes(rho: Map, sigma: Map, measured: Map) -> NDArray[np.bool_]:
     size = rho.shape[::-1]
     expected = cv2.resize(plane, size, interpolation=cv2.INTER_LINEAR)
     believed = cv2.resize(flat.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    return np.asarray((sigma >= NOTHING) & believed
+    return np.asarray((sigma >= NOTHING) & believed & (other < _NEARER * measured)
                       & (np.abs(measured - expected) < _ON_PLANE * expected))
 
 

@@ -90,7 +90,8 @@ class SphericalStereo:
             moving[mask != 0] = 0
         self._memory.forget(wrong)
         fused.sigma[wrong] = NOTHING
-        believed = on_planes(fused.rho, fused.sigma, measured.rho) & ~wrong & (moving == 0)
+        believed = on_planes(fused.rho, fused.sigma, measured.rho, measured.other)
+        believed &= ~wrong & (moving == 0)
         if mask is not None:
             believed &= mask == 0
         return InverseRange(np.where(believed, measured.rho, fused.rho),

@@ -29,7 +29,7 @@ _MARGIN = 8
 _NEAREST = 0.3  # m: the last level, at the latest
 _CLOSEST, _MOST_LEVELS = 2.0, 256  # of the nearest baseline over range
 _LEVEL = 1.5  # px of parallax between levels, of the longest baseline in use
-_REACH = 0.6  # baseline over range up to which a reference takes part: it looks alike
+REACH = 0.6  # baseline over range up to which a reference takes part: it looks alike
 _UNSEEN = 20  # cost of a level for a reference that takes no part
 _CONTRAST, _CONTRAST_LIMIT = 4, 12  # eighths of cost a grey level, and the most of it
 _BLUR = 15
@@ -58,8 +58,8 @@ def levels(baselines: Sequence[float], pixel: float) -> Floats:
     found = [-2 * _LEVEL * pixel / longest_first[0]]
     nearest = min(1 / _NEAREST, _CLOSEST / longest_first[-1])
     while found[-1] < nearest and len(found) < _MOST_LEVELS:
-        usable = [b for b in longest_first if found[-1] * b <= _REACH] or longest_first[-1:]
-        near = found[-1] * usable[0] > _REACH
+        usable = [b for b in longest_first if found[-1] * b <= REACH] or longest_first[-1:]
+        near = found[-1] * usable[0] > REACH
         found.append(found[-1] + (2.0 if near else _LEVEL) * pixel / usable[0])
     return np.array(found)
 
@@ -306,7 +306,7 @@ def _add_reference(view: _View, half: PolarGrid, axes: Floats, small: Image8, po
         np.cos(theta), np.sin(theta), np.cos(azimuth), np.sin(azimuth), own_axes.T @ axes)]
     rows_in_parallel(_place_rows, len(row), *parts, np.float32(1 / half.pixel),
                      np.float32(own_grid.margin - 0.5), row, column)
-    used = level.size if nearest else int(np.searchsorted(level, _REACH / pose.baseline))
+    used = level.size if nearest else int(np.searchsorted(level, REACH / pose.baseline))
     rows_in_parallel(_cost_rows, len(total), view.census, view.contrast, reference.census,
                      reference.contrast, row, column,
                      _polar_table(own_grid, level, pose.baseline), used, total)
