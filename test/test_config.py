@@ -15,6 +15,8 @@ BY_NAME = {'ids': lambda p: p.name}
 
 
 def given_as(parameter: Parameter, value: object) -> object:
+    if parameter.name == 'baseline.direction':
+        return [value] * 3
     return [value] if parameter.is_array else value
 
 
@@ -68,7 +70,8 @@ def test_a_value_reaches_its_own_field_and_no_other(parameter):
     if len(parameter.choices) == 1:
         assert changed == {}
     else:
-        assert list(changed.values()) == [(other,) if parameter.is_array else other]
+        assert list(changed.values()) == [tuple(given_as(parameter, other))
+                                          if parameter.is_array else other]
 
 
 @pytest.mark.parametrize('parameter', NUMBERS, **BY_NAME)
@@ -79,7 +82,7 @@ def test_bounds_belong_and_what_is_beyond_does_not(parameter):
             continue
         at = parameter.kind(bound)
         assert parameter.checked(given_as(parameter, at)) == (
-            (at,) if parameter.is_array else at)
+            tuple(given_as(parameter, at)) if parameter.is_array else at)
         outside = at + beyond * max(1, abs(at))
         with pytest.raises(ParameterError, match=f'^{parameter.name}: .* is outside'):
             parameter.checked(given_as(parameter, outside))
@@ -147,6 +150,8 @@ def test_lists_arrive_as_tuples():
     ({'stereo.block_size': 14}, 'odd'),
     ({'range.min': 5.0, 'range.max': 5.0}, 'less than range.max'),
     ({'range.min': 121.0}, 'less than range.max'),
+    ({'baseline.direction': [0.0, 0.0, 0.0]}, 'is no direction'),
+    ({'baseline.direction': [0.0, 1.0]}, 'is no direction'),
 ])
 def test_values_that_exclude_each_other(values, reason):
     with pytest.raises(ParameterError, match=reason):

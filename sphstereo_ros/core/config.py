@@ -87,6 +87,13 @@ class CameraConfig:
                             low=-math.pi, high=math.pi)
     mount_yaw: float = _p('camera.mount.yaw', 0.0, 'see camera.mount.roll', unit='rad',
                           low=-math.pi, high=math.pi)
+    top_roll: float = _p('camera.top.roll', 0.0, 'binocular: top camera_link in the bottom '
+                         "one's axes, R = Rz(yaw) Ry(pitch) Rx(roll)", unit='rad', low=-math.pi,
+                         high=math.pi)
+    top_pitch: float = _p('camera.top.pitch', 0.0, 'see camera.top.roll', unit='rad',
+                          low=-math.pi, high=math.pi)
+    top_yaw: float = _p('camera.top.yaw', 0.0, 'see camera.top.roll', unit='rad', low=-math.pi,
+                        high=math.pi)
 
 
 @dataclass(frozen=True)
@@ -99,6 +106,10 @@ class BaselineConfig:
                        '0 = unknown, the output is relative', unit='m', low=0.0, high=1000.0)
     speed: float = _p('baseline.speed', 0.0, 'speed: times the stamp difference; 0 = unknown',
                       unit='m/s', low=0.0, high=1000.0)
+    direction: tuple[float, ...] = _p('baseline.direction', (0.0, 0.0, 1.0), 'binocular: from the '
+                                      'bottom to the top camera, along the axes of the bottom '
+                                      'camera_link (x forward, y left, z up); its length does '
+                                      'not matter', low=-1000.0, high=1000.0)
     minimum: float = _p('baseline.minimum', 0.02, 'a shorter measured baseline is a drop '
                         '(hover)', unit='m', low=0.0, high=1000.0)
     relative_sigma: float = _p('baseline.relative_sigma', 0.0, 'standard deviation of the '
@@ -163,6 +174,27 @@ class AlignmentConfig:
     direction_sigma: float = _p('alignment.direction_sigma', 0.02 * math.pi / 180,
                                 'least standard deviation of a refined direction', unit='rad',
                                 low=0.0, high=0.1)
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """The alignment of two cameras."""
+
+    pairs: int = _p('calibration.pairs', 0, 'binocular: estimate camera.top.* from so many pairs '
+                    'before depth is published; 0 = camera.top.* as given', low=0, high=1000,
+                    runtime=False)
+    online: bool = _p('calibration.online', False, 'binocular: follow slow drift of camera.top.*')
+    time_constant: float = _p('calibration.time_constant', 20.0, 'of the filter that follows '
+                              'drift', unit='s', low=0.1, high=1e6)
+    max_rate: float = _p('calibration.max_rate', 0.01 * math.pi / 180, 'fastest drift that is '
+                         'followed, about any axis', unit='rad/s', low=0.0, high=1.0)
+    max_drift: float = _p('calibration.max_drift', 1.0 * math.pi / 180, 'largest drift that is '
+                          'followed, in all', unit='rad', low=0.0, high=math.pi)
+    jump: float = _p('calibration.jump', 0.2 * math.pi / 180, 'a pair that differs by more is '
+                     'reported and never followed', unit='rad', low=0.0, high=math.pi)
+    max_sigma: float = _p('calibration.max_sigma', 0.05 * math.pi / 180, 'standard deviation of '
+                          'a rotation above which a calibration is refused', unit='rad', low=0.0,
+                          high=math.pi)
 
 
 @dataclass(frozen=True)
@@ -234,6 +266,7 @@ class Config:
     pairing: PairingConfig = PairingConfig()
     pose: PoseConfig = PoseConfig()
     alignment: AlignmentConfig = AlignmentConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
     stereo: StereoConfig = StereoConfig()
     range: RangeConfig = RangeConfig()
     points: PointsConfig = PointsConfig()
@@ -275,6 +308,10 @@ def resolve(given: Mapping[str, object]) -> Config:
 
 
 def _check_together(config: Config, given: Mapping[str, Value]) -> None:
+    direction = config.baseline.direction
+    if len(direction) != 3 or math.hypot(*direction) < 1e-6:
+        raise ParameterError(f'baseline.direction: {list(direction)} is no direction: needs x, y, '
+                             'z, not all zero')
     baselines = config.pairing.baselines
     if 0.0 in baselines and len(baselines) > 1:
         raise ParameterError('pairing.baselines: 0 (unused) cannot stand beside other baselines')

@@ -194,8 +194,24 @@ def _residuals(rotation: Floats, direction: Floats, reference: Floats, current: 
         jacobian[k, 2], jacobian[k, 5] = gx * ky - gy * kx, gx * hy - gy * hx
 
 
+def linearised(rotation: Floats, direction: Floats,
+               points: Correspondences) -> tuple[Floats, Floats]:
+    """Residuals (N,), and their derivatives (N, 6) by a small rotation about the current camera's
+    axes and by the direction.
+    """
+    residual, derivatives = np.empty(len(points)), np.empty((len(points), 6))
+    _residuals(rotation, direction, points.reference, points.current, residual, derivatives)
+    return residual, derivatives
+
+
+def tukey_weights(residual: Floats, sigma: Floats, scale: float) -> Floats:
+    """Weights (N,) of least squares in 1/rad², as `refine` takes them at that scale."""
+    ratio = residual / (sigma * _TUKEY * scale)
+    return np.asarray((np.clip(1 - ratio**2, 0, None) / sigma)**2)
+
+
 def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iterations: int = 8,
-           floor: float = 0.2) -> PoseEstimate | None:
+           floor: float = 0.2, free_direction: bool = True) -> PoseEstimate | None:
     """Minimise the angular residuals with Tukey weights (Gauss–Newton on SO(3) × S²).
 
     Parameters
@@ -204,15 +220,16 @@ def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iter
     points : correspondences, outliers among them
     iterations : at most
     floor : least scale of the residuals taken, as a share of the expected ones
+    free_direction : else only the rotation is estimated, and the direction is taken as exact
 
     Returns
     -------
-    None where the correspondences do not fix five parameters.
+    None where the correspondences do not fix the parameters.
 
     """
     residual, derivatives = np.empty(len(points)), np.empty((len(points), 6))
     for iteration in range(iterations):
-        spread = _spread(direction)
+        spread = _spread(direction)[:, :5 if free_direction else 3]
         _residuals(rotation, direction, points.reference, points.current, residual, derivatives)
         normalised = residual / points.sigma
         scale = max(1.4826 * float(np.median(np.abs(normalised))), floor)
@@ -225,11 +242,13 @@ def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iter
             return None
         step = -np.linalg.solve(normal, spread.T @ sums[:, 6])
         rotation = rotations.exp(step[:3]) @ rotation
-        direction = direction + spread[3:, 3:] @ step[3:]
-        direction = direction / np.linalg.norm(direction)
+        if free_direction:
+            direction = direction + spread[3:, 3:] @ step[3:]
+            direction = direction / np.linalg.norm(direction)
         if width <= _TUKEY * scale and np.abs(step).max() < _SMALL_STEP:
             break
-    covariance = np.asarray(np.linalg.inv(normal) * scale**2, np.float64)
+    covariance = np.zeros((5, 5))
+    covariance[:len(normal), :len(normal)] = np.linalg.inv(normal) * scale**2
     return PoseEstimate(rotation, direction, inliers, covariance,
                         scale * float(np.median(points.sigma)))
 

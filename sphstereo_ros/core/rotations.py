@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sphstereo_ros.core.config import CameraConfig
+from sphstereo_ros.core.config import BaselineConfig, CameraConfig
 
 FloatArray = NDArray[np.float64]
 
@@ -65,6 +65,19 @@ def matrix_from_rpy(roll: float, pitch: float, yaw: float) -> FloatArray:
                      [-sp, cp * sr, cp * cr]])
 
 
+def rpy_from_matrix(rotation: FloatArray) -> FloatArray:
+    """(3, 3) rotation matrix → (roll, pitch, yaw) with R = Rz(yaw) Ry(pitch) Rx(roll), radians.
+
+    pitch lies in [−π/2, π/2]; where it is ±π/2, roll is zero.
+    """
+    m = np.asarray(rotation, np.float64)
+    level = math.hypot(m[0, 0], m[1, 0])
+    pitch = math.atan2(-m[2, 0], level)
+    if level < 1e-9:
+        return np.array([0.0, pitch, math.atan2(-m[0, 1], m[1, 1])])
+    return np.array([math.atan2(m[2, 1], m[2, 2]), pitch, math.atan2(m[1, 0], m[0, 0])])
+
+
 def skew(vector: ArrayLike) -> FloatArray:
     """(3,) → (3, 3) with skew(a) · b = a × b."""
     x, y, z = (float(value) for value in np.asarray(vector, np.float64))
@@ -112,3 +125,20 @@ def mount(camera: CameraConfig) -> Mount:
     base_from_link = matrix_from_rpy(camera.mount_roll, camera.mount_pitch, camera.mount_yaw)
     position = np.array([camera.mount_x, camera.mount_y, camera.mount_z])
     return Mount(base_from_link @ OPTICAL_FROM_LINK.T, position)
+
+
+def top_rotation(camera: CameraConfig) -> FloatArray:
+    """(3, 3), bottom camera_optical ← top camera_optical, from the parameters `camera.top.*`."""
+    link = matrix_from_rpy(camera.top_roll, camera.top_pitch, camera.top_yaw)
+    return np.asarray(OPTICAL_FROM_LINK @ link @ OPTICAL_FROM_LINK.T)
+
+
+def top_rpy(rotation: FloatArray) -> FloatArray:
+    """`camera.top.{roll,pitch,yaw}` of a rotation (3, 3), bottom ← top camera_optical."""
+    return rpy_from_matrix(OPTICAL_FROM_LINK.T @ rotation @ OPTICAL_FROM_LINK)
+
+
+def top_direction(baseline: BaselineConfig) -> FloatArray:
+    """Unit vector (3,) from the bottom to the top camera, bottom camera_optical."""
+    direction = OPTICAL_FROM_LINK @ np.asarray(baseline.direction, np.float64)
+    return np.asarray(direction / np.linalg.norm(direction))

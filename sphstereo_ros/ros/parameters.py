@@ -11,14 +11,14 @@ from sphstereo_ros.core.config import PARAMETERS, Config, Parameter, ParameterEr
 
 # Which of the package's parameters each node declares, by the beginnings of their names.
 NODE_PARAMETERS: dict[str, tuple[str, ...]] = {
-    'frame_pairing': ('camera.model', 'camera.mount.', 'baseline.', 'pairing.',
-                      'stereo.working_height', 'points.colour'),
+    'frame_pairing': ('camera.model', 'camera.mount.', 'camera.top.', 'baseline.', 'pairing.',
+                      'calibration.', 'stereo.working_height', 'points.colour'),
     'pose_stabilisation': ('pose.', 'camera.mask', 'pairing.', 'baseline.source'),
     'motion_alignment': ('alignment.', 'camera.mask', 'pairing.', 'baseline.source'),
     'spherical_stereo': ('stereo.', 'range.', 'points.', 'camera.', 'baseline.relative_sigma',
                          'pairing.'),
-    'pipeline': ('camera.', 'baseline.', 'pairing.', 'pose.', 'alignment.', 'stereo.', 'range.',
-                 'points.'),
+    'pipeline': ('camera.', 'baseline.', 'pairing.', 'pose.', 'alignment.', 'calibration.',
+                 'stereo.', 'range.', 'points.'),
     'bag_replay': ('replay.',),
 }
 # Names that ROS itself declares on a node.

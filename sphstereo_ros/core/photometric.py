@@ -1,0 +1,32 @@
+"""Two cameras see the same world in different brightness: one is made to look like the other."""
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .frames import Image8
+
+_LEVELS = 256
+
+
+def matched(image: Image8, like: Image8) -> Image8:
+    """`image` (H, 2H) with the grey levels that `like` (any size) has at the same quantiles.
+
+    Gain, offset, exposure and tone curve, and white balance as far as grey levels tell, go with
+    any monotone curve; the two spheres see (nearly) the same, so their histograms, weighted by
+    solid angle, differ by that curve alone (histogram matching, Gonzalez and Woods).
+    """
+    source, target = (_quantiles(picture) for picture in (image, like))
+    curve = np.interp(source, target, np.arange(_LEVELS))
+    return np.asarray(np.rint(curve).astype(np.uint8)[image])
+
+
+def _quantiles(image: Image8) -> NDArray[np.float64]:
+    """Share of the sphere (256,) that is darker than each level or, by half, as bright."""
+    height = image.shape[0]
+    weight = np.cos(np.pi * ((np.arange(height) + 0.5) / height - 0.5))
+    rows = np.broadcast_to(weight[:, None], image.shape)
+    share = np.bincount(image.ravel(), weights=rows.ravel(), minlength=_LEVELS)
+    # Levels that do not occur have none: strictly rising, for interpolation.
+    share = share / share.sum() + 1e-9
+    return np.asarray((np.cumsum(share) - share / 2) / share.sum())
