@@ -174,13 +174,29 @@ class AlignmentCalibration:
 
         Drops: `size_changed`, `too_few_points`, `too_few_inliers`, `cameras_swapped`.
         """
-        fit = self._fitted(top.image, bottom.image)
+        fit = self.fit(top.image, bottom.image)
         if isinstance(fit, Drop):
             self.drops.append(fit)
         else:
             self.fits.append(fit)
             self._prior = fit.rotation
         return fit
+
+    def fit(self, top: Image8, bottom: Image8) -> PairFit | Drop:
+        """What a pair of images (H, 2H) tells by itself; it is not kept. Drops as for `add`."""
+        if top.shape != bottom.shape:
+            return Drop('size_changed', f'{top.shape} and {bottom.shape}')
+        top = matched(top, bottom)
+        coarse = self._coarse(top, bottom)
+        if isinstance(coarse, Drop):
+            return coarse
+        height = self.config.alignment.working_height
+        images = [im if im.shape[0] < 1.3 * height else reduced(im, height)
+                  for im in (top, bottom)]
+        grid = PolarGrid(min(height, images[1].shape[0]), _MARGIN, _WRAP)
+        pose = RelativePose(coarse.rotation, coarse.direction)
+        view = current_view(images[1], pose.direction, grid, self.config.alignment.max_points)
+        return self._refined(images[0], view, pose)
 
     def result(self) -> CalibrationResult | Drop:
         """What all pairs tell together, or why that is not enough.
@@ -205,21 +221,6 @@ class AlignmentCalibration:
         return self._judged(chosen, free, points, len(good))
 
     # One pair
-
-    def _fitted(self, top: Image8, bottom: Image8) -> PairFit | Drop:
-        if top.shape != bottom.shape:
-            return Drop('size_changed', f'{top.shape} and {bottom.shape}')
-        top = matched(top, bottom)
-        coarse = self._coarse(top, bottom)
-        if isinstance(coarse, Drop):
-            return coarse
-        height = self.config.alignment.working_height
-        images = [im if im.shape[0] < 1.3 * height else reduced(im, height)
-                  for im in (top, bottom)]
-        grid = PolarGrid(min(height, images[1].shape[0]), _MARGIN, _WRAP)
-        pose = RelativePose(coarse.rotation, coarse.direction)
-        view = current_view(images[1], pose.direction, grid, self.config.alignment.max_points)
-        return self._refined(images[0], view, pose)
 
     def _refined(self, top: Image8, view: CurrentView, pose: RelativePose,
                  rounds: int = _ROUNDS) -> PairFit | Drop:
@@ -251,15 +252,20 @@ class AlignmentCalibration:
         config = self.config.pose
         before, now = (reduced(im, config.working_height) for im in (top, bottom))
         mask = None if self._mask is None else _resized(self._mask, now.shape)
-        found = self._start(track(before, now, self._prior, config.max_points, mask))
+        found = self.from_points(track(before, now, self._prior, config.max_points, mask))
         if isinstance(found, PoseEstimate):
             return found
-        wide = self._start(match(before, now, config.max_points, mask), matches=True)
+        wide = self.from_points(match(before, now, config.max_points, mask), matches=True)
         if isinstance(wide, Drop):
             return found if found.cause != 'too_few_points' else wide
-        return self._start(track(before, now, wide.rotation, config.max_points, mask))
+        return self.from_points(track(before, now, wide.rotation, config.max_points, mask))
 
-    def _start(self, points: Correspondences, *, matches: bool = False) -> PoseEstimate | Drop:
+    def from_points(self, points: Correspondences, *,
+                    matches: bool = False) -> PoseEstimate | Drop:
+        """The rotation that most correspondences (reference: top) fit, however large it is.
+
+        matches : they come from descriptors, so more of them are wrong
+        """
         config = self.config.pose
         if len(points) < config.min_inliers:
             return Drop('too_few_points', f'{len(points)} points with texture')

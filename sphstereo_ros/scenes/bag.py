@@ -17,6 +17,7 @@ from sphstereo_ros.ros.conversions import header as header_message
 from .sequence import SavedSequence, TruthFrame, rounded_range
 
 CAMERA, ODOM, BASE = 'camera_optical', 'odom', 'base_link'
+TOP_CAMERA = 'top_camera_optical'
 
 
 def write_bag(sequence: SavedSequence, path: Path) -> None:
@@ -31,6 +32,33 @@ def write_bag(sequence: SavedSequence, path: Path) -> None:
                       compressed_message(make, key, 'bgr8; jpeg compressed bgr8', _jpeg(frame)))
             out.write('/ground_truth/range', frame.stamp,
                       depth_message(make, key, _range(sequence, index, frame)))
+
+
+def write_binocular_bag(sequence: SavedSequence, path: Path) -> None:
+    """Write the pairs of a folder as `/bottom/image/compressed`, `/top/image/compressed`, and, of
+    the bottom camera, `/odometry` and `/ground_truth/range` as `write_bag` does.
+
+    Raises
+    ------
+    ValueError
+        where the folder has no pairs
+
+    """
+    pairs = sequence.meta.get('pairs')
+    if not pairs:
+        raise ValueError(f'{sequence.folder} has no pairs of frames')
+    with McapOutput(path) as out:
+        for pair in pairs:
+            for side, camera in (('top', TOP_CAMERA), ('bottom', CAMERA)):
+                index = pair[side]
+                frame = sequence[index]
+                key = FrameKey(frame.stamp, camera)
+                image = compressed_message(make, key, 'bgr8; jpeg compressed bgr8', _jpeg(frame))
+                if side == 'bottom':
+                    out.write('/odometry', frame.stamp, odometry(frame))
+                    out.write('/ground_truth/range', frame.stamp,
+                              depth_message(make, key, _range(sequence, index, frame)))
+                out.write(f'/{side}/image/compressed', frame.stamp, image)
 
 
 def odometry(frame: TruthFrame) -> object:

@@ -31,7 +31,7 @@ class ImageEffects:
     gain : of the exposure, for the scene; exposure : largest relative change of it from frame to
     frame; step : factor of the exposure from STEP_AT of the frames on; flicker : relative
     amplitude of the lamps' flicker, which a rolling shutter turns into bands; jpeg : quality,
-    None = no JPEG
+    None = no JPEG; white_balance : gains of red, green and blue
     """
 
     gain: float = 1.0
@@ -40,6 +40,7 @@ class ImageEffects:
     jpeg: int | None = 92
     step: float = 1.0
     flicker: float = 0.0
+    white_balance: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
     def exposures(self, seed: int, frames: int) -> NDArray[np.float64]:
         """The exposure of each frame (frames,), relative to the first, which is nominal."""

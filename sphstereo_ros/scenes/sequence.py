@@ -120,6 +120,8 @@ class RenderedSequence(Sequence[TruthFrame]):
         effects = self.effects
         if effects.flicker:
             light = light * effects.row_exposures(self.seed, index, len(light))[:, None, None]
+        if effects.white_balance != (1.0, 1.0, 1.0):
+            light = light * np.asarray(effects.white_balance, np.float32)
         rng = np.random.default_rng([self.seed, 3, index])
         image = develop(light, effects.gain * float(self.exposures[index]))
         picture = to_bytes(with_noise(image, effects.noise, rng))
@@ -311,9 +313,10 @@ def save_sequence(sequence: Sequence[TruthFrame], folder: str | Path, name: str 
         if frame.moving is not None:
             entry['moving'] = f'moving_{index:04d}.png'
             cv2.imwrite(str(folder / entry['moving']), np.uint8(255) * frame.moving)
-        if small_height is not None and isinstance(sequence, RenderedSequence):
+        camera = getattr(sequence, 'camera', None)
+        if small_height is not None and camera is not None:
             entry['range_small'] = f'range_small_{index:04d}.npz'
-            small = sequence.camera(index, small_height).range()
+            small = camera(index, small_height).range()
             np.savez_compressed(folder / entry['range_small'], range=rounded_range(small, 12))
         entries.append(entry)
     _add_motions(entries)
