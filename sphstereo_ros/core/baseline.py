@@ -91,6 +91,11 @@ class Track(Generic[S]):
         before = self._samples[place - 1]
         return before, after, (stamp - before.stamp) / (after.stamp - before.stamp)
 
+    def before(self, stamp: int) -> S | None:
+        """The last sample before `stamp`; None where there is none."""
+        place = bisect_left(self._stamps, stamp)
+        return self._samples[place - 1] if place else None
+
     def between(self, first: int, last: int) -> list[S]:
         """Samples strictly between two stamps."""
         return self._samples[bisect_left(self._stamps, first + 1):bisect_left(self._stamps, last)]

@@ -239,6 +239,26 @@ class PointsConfig:
 
 
 @dataclass(frozen=True)
+class ObstaclesConfig:
+    """What is an obstacle: all of it in the level frame, from the origin of `base_link`."""
+
+    height_above: float = _p('obstacles.height_above', 1.0, 'obstacles are looked for up to that '
+                             'much above base_link', unit='m', low=0.0, high=100.0)
+    height_below: float = _p('obstacles.height_below', 1.0, 'and down to that much below it',
+                             unit='m', low=0.0, high=100.0)
+    minimum: float = _p('obstacles.min', 0.3, 'what is nearer is told as that far', unit='m',
+                        low=0.01, high=10.0)
+    maximum: float = _p('obstacles.max', 20.0, 'farther obstacles are not told', unit='m',
+                        low=0.5, high=600.0)
+    ground_clearance: float = _p('obstacles.ground_clearance', 0.2, 'what is lower above the '
+                                 'ground is no obstacle', unit='m', low=0.0, high=2.0)
+    vehicle_width: float = _p('obstacles.vehicle_width', 0.6, 'of the way that must be free, for '
+                              'the time to contact', unit='m', low=0.0, high=100.0)
+    require_attitude: bool = _p('obstacles.require_attitude', True, 'without roll and pitch there '
+                                'is no result; false: base_link is taken for level')
+
+
+@dataclass(frozen=True)
 class ReplayConfig:
     """The node `bag_replay`."""
 
@@ -270,6 +290,7 @@ class Config:
     stereo: StereoConfig = StereoConfig()
     range: RangeConfig = RangeConfig()
     points: PointsConfig = PointsConfig()
+    obstacles: ObstaclesConfig = ObstaclesConfig()
     replay: ReplayConfig = ReplayConfig()
 
 
@@ -327,3 +348,8 @@ def _check_together(config: Config, given: Mapping[str, Value]) -> None:
         raise ParameterError('stereo.block_size: must be odd')
     if config.range.minimum >= config.range.maximum:
         raise ParameterError('range.min: must be less than range.max')
+    if config.obstacles.minimum >= config.obstacles.maximum:
+        raise ParameterError('obstacles.min: must be less than obstacles.max')
+    if config.obstacles.height_above + config.obstacles.height_below <= 0:
+        raise ParameterError('obstacles.height_above, obstacles.height_below: there is no height '
+                             'between them')

@@ -17,6 +17,7 @@ NODE_PARAMETERS: dict[str, tuple[str, ...]] = {
     'motion_alignment': ('alignment.', 'camera.mask', 'pairing.', 'baseline.source'),
     'spherical_stereo': ('stereo.', 'range.', 'points.', 'camera.', 'baseline.relative_sigma',
                          'pairing.'),
+    'obstacle_detection': ('obstacles.', 'camera.', 'range.'),
     'pipeline': ('camera.', 'baseline.', 'pairing.', 'pose.', 'alignment.', 'calibration.',
                  'stereo.', 'range.', 'points.'),
     'bag_replay': ('replay.',),

@@ -1,0 +1,126 @@
+"""What is free: where nothing worth mentioning could stand unseen.
+
+At some distances, a thin thing is put at every place in turn: before so many pixels must be
+measured as farther, or it could hide there.
+"""
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import ObstaclesConfig
+from .ground import Ground
+from .jit import kernel
+from .sectors import FIRST_SECTOR, SECTOR_WIDTH, SECTORS
+
+Counts = NDArray[np.int32]
+Floats = NDArray[np.float64]
+
+STEEPEST = math.radians(60)  # elevations beyond are not looked at
+# What could hide, up to 10 m; farther off, something of that angular size.
+_WIDTH, _HEIGHT, _FAR = 0.15, 0.5, 10.0
+_CLEAR = 0.6  # of its pixels must be measured as farther
+_STEPS, _RATIO, _NEAREST = 8, 1.5, 0.5  # distances at which that is asked
+_LEAST_ROOM = 0.05  # m between ground and the top of the band
+
+
+def distances_asked(maximum: float) -> Floats:
+    """Metres at which things could hide, rising, the last `maximum`."""
+    steps = maximum / _RATIO ** np.arange(_STEPS)[::-1]
+    return np.asarray(steps[steps >= min(_NEAREST, maximum)])
+
+
+def free_sectors(seen: Counts, distances: Floats, limits: ObstaclesConfig,
+                 ground: Ground | None, camera: Floats, cell: float) -> NDArray[np.bool_]:
+    """Sectors (72,) in which nothing could hide within the last of `distances`.
+
+    Parameters
+    ----------
+    seen : (len(distances) + 1, E, C) weight of the pixels by how many of the distances they are
+        certainly farther than, by elevation from −60° up in steps of `cell` rad, and by azimuth
+        clockwise from the edge of the first sector
+    camera : (3,) its position in the level frame
+
+    """
+    plane = (0.0, 0.0, -math.inf) if ground is None else (*ground.slope, ground.height)
+    bounds = np.array([-limits.height_below, limits.height_above, limits.ground_clearance])
+    return np.asarray(_free(seen, distances, bounds, np.array(plane), camera, cell))
+
+
+@kernel
+def _sums(layer: Counts, out: NDArray[np.int64]) -> None:  # pragma: no cover - compiled
+    """Summed area table (E + 1, 2C + 1) of (E, C), twice round."""
+    rows, columns = layer.shape
+    for e in range(rows):
+        run = 0
+        for c in range(2 * columns):
+            run += layer[e, c if c < columns else c - columns]
+            out[e + 1, c + 1] = out[e, c + 1] + run
+
+
+@kernel
+def _within(sums: NDArray[np.int64], e0: int, e1: int, c0: int,
+            c1: int) -> int:  # pragma: no cover - compiled
+    return int(sums[e1, c1] - sums[e0, c1] - sums[e1, c0] + sums[e0, c0])
+
+
+@kernel
+def _hides(sums: NDArray[np.int64], clear: NDArray[np.int64], angle: float, distance: float,
+           size: Floats, low: float, high: float, up: float,
+           cell: float) -> bool:  # pragma: no cover - compiled
+    """Whether a thing of `size` could hide in front, between two heights.
+
+    angle : of its middle, in columns; distance : from the camera; up : height of the camera
+    """
+    rows, columns = sums.shape[0] - 1, sums.shape[1] // 2
+    wide = max(1, round(size[0] / distance * columns / (2 * np.pi)))
+    c0 = math.floor(angle - 0.5 * wide + 0.5) % columns
+    tall = min(size[1], high - low)
+    steps = max(1, math.ceil(2 * (high - low - tall) / tall - 1e-9) + 1)
+    for k in range(steps):
+        bottom = low + (high - low - tall) * (k / (steps - 1) if steps > 1 else 0.0)
+        e0 = math.floor((math.atan2(bottom - up, distance) + STEEPEST) / cell + 0.25)
+        e1 = math.ceil((math.atan2(bottom + tall - up, distance) + STEEPEST) / cell - 0.25)
+        e0, e1 = max(int(e0), 0), min(int(e1), rows)
+        if e1 <= e0:
+            continue
+        total = _within(sums, e0, e1, c0, c0 + wide)
+        if total <= 0 or _within(clear, e0, e1, c0, c0 + wide) < _CLEAR * total:
+            return True
+    return False
+
+
+@kernel
+def _free(seen: Counts, distances: Floats, bounds: Floats, plane: Floats, camera: Floats,
+          cell: float) -> NDArray[np.bool_]:  # pragma: no cover - compiled
+    layers, rows, columns = seen.shape
+    sums = np.zeros((rows + 1, 2 * columns + 1), np.int64)
+    clear = np.zeros((rows + 1, 2 * columns + 1), np.int64)
+    farther = np.zeros((rows, columns), np.int32)
+    for layer in range(layers):
+        farther += seen[layer]
+    _sums(farther, sums)
+    out = np.ones(SECTORS, np.bool_)
+    size = np.empty(2)
+    for k in range(layers - 1):
+        farther -= seen[k]  # what is left is farther than distances[k]
+        _sums(farther, clear)
+        size[0] = _WIDTH * max(1.0, distances[k] / _FAR)
+        size[1] = _HEIGHT * max(1.0, distances[k] / _FAR)
+        for column in range(columns):
+            sector = column * SECTORS // columns
+            if not out[sector]:
+                continue
+            azimuth = FIRST_SECTOR - 0.5 * SECTOR_WIDTH + (column + 0.5) * 2 * np.pi / columns
+            x, y = distances[k] * math.cos(azimuth), -distances[k] * math.sin(azimuth)
+            low = max(bounds[0], plane[0] * x + plane[1] * y + plane[2] + bounds[2])
+            if bounds[1] - low < _LEAST_ROOM:
+                continue
+            x, y = x - camera[0], y - camera[1]
+            turned = math.atan2(-y, x) - FIRST_SECTOR + 0.5 * SECTOR_WIDTH
+            if _hides(sums, clear, turned * columns / (2 * np.pi), math.hypot(x, y), size, low,
+                      bounds[1], camera[2], cell):
+                out[sector] = False
+    return out
