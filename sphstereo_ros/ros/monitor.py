@@ -39,12 +39,18 @@ class Monitor:
     name : the status' name
     clock : monotonic seconds
     on_new_cause : called at the first drop of each cause
+    stall : seconds without input, or without output, that are a stall
+    stall_level : of a status that tells a stall
     """
 
     def __init__(self, name: str, clock: Callable[[], float] = time.monotonic,
-                 on_new_cause: Callable[[Drop], None] = lambda drop: None) -> None:
+                 on_new_cause: Callable[[Drop], None] = lambda drop: None,
+                 stall: float = STALL, stall_level: int = WARN) -> None:
         self.name = name
         self.clock = clock
+        self.stall = stall
+        self._stall_level = stall_level
+        self._fault = ''
         self._on_new_cause = on_new_cause
         self._lock = threading.Lock()
         self._drops: Counter[str] = Counter()
@@ -72,6 +78,11 @@ class Monitor:
             self._out += 1
             self._latencies.append(self._last_out - arrival)
             self._values.update(values or {})
+
+    def fault(self, text: str) -> None:
+        """Say what keeps this part from working, from now on; '' = nothing."""
+        with self._lock:
+            self._fault = text
 
     def dropped(self, drop: Drop) -> None:
         """Count a drop."""
@@ -117,12 +128,15 @@ class Monitor:
     def _judge(self, recent: Counter[str], now: float) -> tuple[int, str]:
         if recent['internal_error']:
             return ERROR, 'internal error'
+        if self._fault:
+            return ERROR, self._fault
         if self._in == 0:
             return OK, 'waiting for input'
-        if now - self._last_in > STALL:
-            return WARN, f'stalled: no input for {now - self._last_in:.1f} s'
+        if now - self._last_in > self.stall:
+            return self._stall_level, f'stalled: no input for {now - self._last_in:.1f} s'
         unexpected = [f'{n} {cause}' for cause, n in recent.most_common() if cause not in EXPECTED]
-        if now - self._last_out > STALL:
-            return WARN, ', '.join([f'stalled: no output for {now - self._last_out:.1f} s',
-                                    *unexpected])
+        silent = now - self._last_out
+        if silent > self.stall:
+            return self._stall_level, ', '.join([f'stalled: no output for {silent:.1f} s',
+                                                 *unexpected])
         return (WARN, 'dropped: ' + ', '.join(unexpected)) if unexpected else (OK, 'running')

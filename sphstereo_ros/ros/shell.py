@@ -28,7 +28,7 @@ from sphstereo_ros.ros import qos
 from sphstereo_ros.ros.conversions import diagnostic_message
 from sphstereo_ros.ros.images import read_mask
 from sphstereo_ros.ros.live_messages import make, message_class
-from sphstereo_ros.ros.monitor import Monitor
+from sphstereo_ros.ros.monitor import STALL, WARN, Monitor
 from sphstereo_ros.ros.parameters import NodeParameters, names_of
 from sphstereo_ros.ros.transport import PROFILE, prepare_process
 from sphstereo_ros.ros.worker import Worker
@@ -101,12 +101,13 @@ class Shell:
         """The parameters that hold now."""
         return self.parameters.config
 
-    def monitor(self, part: str) -> Monitor:
+    def monitor(self, part: str, stall: float = STALL, stall_level: int = WARN) -> Monitor:
         """Make the monitor of a part of this node; a part of its own name is the node itself."""
         name = self.node.get_name()
         monitor = Monitor(name if part == name else f'{name}: {part}', on_new_cause=lambda drop:
                           self.log.warning(f'{part}: dropped, {drop.cause}: {drop.detail} '
-                                           '(said once; counted in /diagnostics)'))
+                                           '(said once; counted in /diagnostics)'),
+                          stall=stall, stall_level=stall_level)
         self._monitors.append(monitor)
         return monitor
 

@@ -1,0 +1,1 @@
+"""Obstacles to a flight controller by MAVLink, without ROS between."""
