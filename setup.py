@@ -5,7 +5,7 @@ from setuptools import find_packages, setup
 
 NAME = 'sphstereo_ros'
 NODES = ('frame_pairing', 'pose_stabilisation', 'motion_alignment', 'spherical_stereo',
-         'pipeline', 'bag_replay')
+         'obstacle_detection', 'pipeline', 'bag_replay')
 
 setup(
     name=NAME,

@@ -1,4 +1,4 @@
-"""The four stages as separate processes, and where the camera is."""
+"""The stages as separate processes, and where the camera is."""
 from __future__ import annotations
 
 import math
@@ -30,10 +30,13 @@ def actions(context):
 
     files = argument('params_file').split(',')
     sim_time = argument('use_sim_time').lower() == 'true'
+    stages = STAGES
+    if argument('obstacles').lower() == 'true':
+        stages = (*STAGES, 'obstacle_detection')
     camera = load_config([Path(file) for file in files]).camera
     nodes = [Node(package=PACKAGE, executable=stage, name=stage,
                   namespace=argument('namespace'), output='screen',
-                  parameters=[*files, {'use_sim_time': sim_time}]) for stage in STAGES]
+                  parameters=[*files, {'use_sim_time': sim_time}]) for stage in stages]
     return [
         *nodes,
         transform('base_link', 'camera_link', camera.mount_x, camera.mount_y, camera.mount_z,
@@ -50,6 +53,8 @@ def generate_launch_description():
         DeclareLaunchArgument('namespace', default_value='', description='of all topics'),
         DeclareLaunchArgument('camera_frame', default_value='camera_optical',
                               description='frame_id of the input images'),
+        DeclareLaunchArgument('obstacles', default_value='true',
+                              description='false leaves obstacle_detection out'),
         DeclareLaunchArgument('use_sim_time', default_value='false',
                               description='true where /clock is published'),
         OpaqueFunction(function=actions)])

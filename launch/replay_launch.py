@@ -1,4 +1,4 @@
-"""A recording through the four stages, each a process of its own."""
+"""A recording through the stages, each a process of its own."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -31,6 +31,7 @@ def actions(context):
         PythonLaunchDescriptionSource(str(share / 'launch' / 'pipeline_launch.py')),
         launch_arguments={'params_file': argument('params_file'), 'use_sim_time': 'true',
                           'namespace': argument('namespace'),
+                          'obstacles': argument('obstacles'),
                           'camera_frame': argument('camera_frame')}.items())
     replay = Node(
         package=PACKAGE, executable='bag_replay', name='bag_replay', output='screen',
@@ -51,6 +52,8 @@ def generate_launch_description():
         DeclareLaunchArgument('params_file', default_value=str(default),
                               description='parameter files of all nodes, separated by commas'),
         DeclareLaunchArgument('namespace', default_value='', description='of all topics'),
+        DeclareLaunchArgument('obstacles', default_value='true',
+                              description='false leaves obstacle_detection out'),
         DeclareLaunchArgument('camera_frame', default_value='camera_optical',
                               description='frame_id of the images'),
         OpaqueFunction(function=actions)])

@@ -21,7 +21,7 @@ mavlink = pytest.importorskip('pymavlink.dialects.v20.ardupilotmega')
 
 from sectors import FORWARD, LEFT, RIGHT, STAMP, sectors  # noqa: E402
 
-from sphstereo_ros.core.config import ObstacleOutputConfig  # noqa: E402
+from sphstereo_ros.core.config import MavlinkConfig  # noqa: E402
 from sphstereo_ros.core.sectors import SECTORS, ObstacleSectors  # noqa: E402
 from sphstereo_ros.mavlink import link as link_module  # noqa: E402
 from sphstereo_ros.mavlink.encoding import Decoder, MissingLibraryError  # noqa: E402
@@ -191,8 +191,8 @@ Connect = Callable[..., MavlinkLink]
 def connect(told: Told) -> Iterator[Connect]:
     links: list[MavlinkLink] = []
 
-    def start(url: str, **more: Any) -> MavlinkLink:
-        made = MavlinkLink(replace(ObstacleOutputConfig(mavlink_url=url), **more), told)
+    def start(url: str, stall: float = 0.5, **more: Any) -> MavlinkLink:
+        made = MavlinkLink(replace(MavlinkConfig(url=url), **more), stall, told)
         links.append(made)
         made.start()
         return made
@@ -255,7 +255,7 @@ def test_obstacle_distance_on_the_wire(autopilot: Autopilot, connect: Connect,
 def test_points_come_before_the_sectors_and_belong_together(autopilot: Autopilot,
                                                             connect: Connect) -> None:
     """ArduPilot forgets all it knows at the first point of a new time."""
-    link = connect(autopilot.url, mavlink_send_3d=True, mavlink_points_3d=3)
+    link = connect(autopilot.url, send_3d=True, points_3d=3)
     found = sectors({LEFT: 5.0, FORWARD: 7.0, 40: 9.0, 41: 8.0}, too_close=[RIGHT])
     sent(autopilot, link, found)
     of_obstacles = [m for m in autopilot.messages if m.get_type().startswith('OBSTACLE')]
@@ -283,7 +283,7 @@ def test_it_is_numbered_without_gaps(connect: Connect) -> None:
 
 def test_other_identities(connect: Connect) -> None:
     with closing(UdpAutopilot()) as autopilot:
-        connect(autopilot.url, mavlink_system_id=7, mavlink_component_id=158)
+        connect(autopilot.url, system_id=7, component_id=158)
         beat, *_ = autopilot.wait('HEARTBEAT')
         assert (beat.get_srcSystem(), beat.get_srcComponent()) == (7, 158)
 
@@ -443,8 +443,8 @@ def test_who_takes_nothing_gets_nothing_old(connect: Connect, told: Told) -> Non
         server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
         server.bind(('127.0.0.1', 0))
         server.listen()
-        link = connect(f'tcp:127.0.0.1:{server.getsockname()[1]}', mavlink_send_3d=True,
-                       mavlink_points_3d=72)
+        link = connect(f'tcp:127.0.0.1:{server.getsockname()[1]}', send_3d=True,
+                       points_3d=72)
         deaf, _ = server.accept()
         with deaf:
             everywhere = sectors(dict.fromkeys(range(SECTORS), 5.0))
@@ -518,6 +518,6 @@ def test_wrong_urls(url: str) -> None:
 def test_without_pymavlink_it_says_so(monkeypatch: pytest.MonkeyPatch, told: Told) -> None:
     monkeypatch.setitem(__import__('sys').modules, 'pymavlink.dialects.v20.ardupilotmega', None)
     with pytest.raises(MissingLibraryError, match='pip install pymavlink'):
-        MavlinkLink(ObstacleOutputConfig(mavlink_url='udpout:127.0.0.1:14550'), told)
+        MavlinkLink(MavlinkConfig(url='udpout:127.0.0.1:14550'), 0.5, told)
     with pytest.raises(MissingLibraryError):
         Decoder()

@@ -133,7 +133,7 @@ def test_mavros_keeps_three_states_apart_at_any_limits(between: tuple[float, flo
     assert sent[8] == most + 1
     assert sent[9] == 65535
     assert least <= sent[7] < most
-    assert sent[7] <= 100 * max(distance, minimum) + 1e-3
+    assert sent[7] <= 100 * max(distance, minimum) + 0.02
     assert abs(sent[7] - 100 * distance) <= 2.6
 
 

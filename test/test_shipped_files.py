@@ -16,7 +16,8 @@ from sphstereo_ros.replay.parameter_files import load_config, read_file
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGS = sorted((ROOT / 'config').glob('*.yaml'))
-STAGES = ['frame_pairing', 'pose_stabilisation', 'motion_alignment', 'spherical_stereo']
+STAGES = ['frame_pairing', 'pose_stabilisation', 'motion_alignment', 'spherical_stereo',
+          'obstacle_detection']
 
 
 def test_there_are_configs() -> None:
@@ -111,11 +112,11 @@ def test_pipeline_launch(tmp_path: Path) -> None:
     file.write_text('/**:\n  ros__parameters:\n    camera.mount: {x: 0.5, yaw: 1.25}\n')
     started = nodes(performed('pipeline_launch.py', params_file=str(file), namespace='robot'))
     assert [n['executable'] for n in started] == [*STAGES, *['static_transform_publisher'] * 2]
-    for node in started[:4]:
+    for node in started[:5]:
         assert node['package'] == 'sphstereo_ros'
         assert node['parameters'] == [str(file), {'use_sim_time': False}]
         assert node['namespace'] == 'robot'
-    mount, optical = (arguments(node) for node in started[4:])
+    mount, optical = (arguments(node) for node in started[5:])
     assert (mount['--x'], mount['--yaw'], mount['--frame-id'],
             mount['--child-frame-id']) == ('0.5', '1.25', 'base_link', 'camera_link')
     turned = rotations.matrix_from_rpy(*(float(optical[f'--{axis}'])
@@ -123,6 +124,13 @@ def test_pipeline_launch(tmp_path: Path) -> None:
     np.testing.assert_allclose(turned, rotations.OPTICAL_FROM_LINK.T, atol=1e-12)
     assert (optical['--frame-id'], optical['--child-frame-id']) == ('camera_link',
                                                                    'camera_optical')
+
+
+@pytest.mark.usefixtures('launch_modules')
+def test_obstacles_may_be_left_out() -> None:
+    started = nodes(performed('pipeline_launch.py', params_file=str(CONFIGS[0]),
+                              obstacles='false'))
+    assert [n['executable'] for n in started[:-2]] == STAGES[:-1]
 
 
 def arguments(node: dict[str, Any]) -> dict[str, str]:
@@ -134,7 +142,8 @@ def arguments(node: dict[str, Any]) -> dict[str, str]:
 def test_replay_launch() -> None:
     include, replay, ended = performed('replay_launch.py', bag='a.mcap', rate='0.5')
     assert Path(include.args[0].args[0]).is_file()
-    assert dict(include.kwargs['launch_arguments'])['use_sim_time'] == 'true'
+    given = dict(include.kwargs['launch_arguments'])
+    assert (given['use_sim_time'], given['obstacles']) == ('true', 'true')
     parameters, = replay.kwargs['parameters']
     assert (parameters['replay.bag'], parameters['replay.rate']) == ('a.mcap', 0.5)
     assert set(parameters) <= set(PARAMETERS)

@@ -256,25 +256,25 @@ class ObstaclesConfig:
                               'the time to contact', unit='m', low=0.0, high=100.0)
     require_attitude: bool = _p('obstacles.require_attitude', True, 'without roll and pitch there '
                                 'is no result; false: base_link is taken for level')
+    stall: float = _p('obstacles.stall', 0.5, 'no new depth for so long is an error in '
+                      '/diagnostics; what is older is not sent', unit='s', low=0.05, high=10.0)
 
 
 @dataclass(frozen=True)
-class ObstacleOutputConfig:
-    """What becomes of the obstacles that were found."""
+class MavlinkConfig:
+    """The way of obstacles to an autopilot."""
 
-    stall: float = _p('obstacles.stall', 0.5, 'no new depth for so long is an error in '
-                      '/diagnostics; what is older is not sent', unit='s', low=0.05, high=10.0)
-    mavlink_url: str = _p('obstacles.mavlink.url', '', 'autopilot: udpout:HOST:PORT (sends '
-                          'there), udpin:HOST:PORT (listens here), tcp:HOST:PORT or '
-                          '/dev/DEVICE,BAUD; empty = no MAVLink', runtime=False)
-    mavlink_system_id: int = _p('obstacles.mavlink.system_id', 1, 'that of the vehicle', low=1,
-                                high=255, runtime=False)
-    mavlink_component_id: int = _p('obstacles.mavlink.component_id', 196, '196 = obstacle '
-                                   'avoidance', low=1, high=255, runtime=False)
-    mavlink_send_3d: bool = _p('obstacles.mavlink.send_3d', False, 'OBSTACLE_DISTANCE_3D, too: '
-                               'ArduPilot only', runtime=False)
-    mavlink_points_3d: int = _p('obstacles.mavlink.points_3d', 12, 'how many points at most, the '
-                                'nearest, one a sector', low=1, high=72, runtime=False)
+    url: str = _p('obstacles.mavlink.url', '', 'autopilot: udpout:HOST:PORT (sends there), '
+                  'udpin:HOST:PORT (listens here), tcp:HOST:PORT or /dev/DEVICE,BAUD; '
+                  'empty = no MAVLink', runtime=False)
+    system_id: int = _p('obstacles.mavlink.system_id', 1, 'that of the vehicle', low=1, high=255,
+                        runtime=False)
+    component_id: int = _p('obstacles.mavlink.component_id', 196, '196 = obstacle avoidance',
+                           low=1, high=255, runtime=False)
+    send_3d: bool = _p('obstacles.mavlink.send_3d', False, 'OBSTACLE_DISTANCE_3D, too: ArduPilot '
+                       'only', runtime=False)
+    points_3d: int = _p('obstacles.mavlink.points_3d', 12, 'how many points at most, the nearest, '
+                        'one a sector', low=1, high=72, runtime=False)
 
 
 @dataclass(frozen=True)
@@ -310,7 +310,7 @@ class Config:
     range: RangeConfig = RangeConfig()
     points: PointsConfig = PointsConfig()
     obstacles: ObstaclesConfig = ObstaclesConfig()
-    obstacle_output: ObstacleOutputConfig = ObstacleOutputConfig()
+    mavlink: MavlinkConfig = MavlinkConfig()
     replay: ReplayConfig = ReplayConfig()
 
 

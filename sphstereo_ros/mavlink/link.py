@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from sphstereo_ros.core.config import ObstacleOutputConfig
+from sphstereo_ros.core.config import MavlinkConfig
 from sphstereo_ros.core.frames import Drop
 from sphstereo_ros.core.sectors import ObstacleSectors
 from sphstereo_ros.mavlink.encoding import Decoder, Encoder
@@ -55,6 +55,7 @@ class MavlinkLink:
     """Sends the newest obstacles, and a heartbeat; answers and asks for the time.
 
     config : its url is not empty
+    stall : seconds after which obstacles are too old to be sent
     told : counts what is sent and what is not
 
     Raises
@@ -66,11 +67,12 @@ class MavlinkLink:
 
     """
 
-    def __init__(self, config: ObstacleOutputConfig, told: Told) -> None:
-        self._address = parse_url(config.mavlink_url)
+    def __init__(self, config: MavlinkConfig, stall: float, told: Told) -> None:
+        self._address = parse_url(config.url)
         self._config = config
+        self._stall = stall
         self._told = told
-        self._encoder = Encoder(config.mavlink_system_id, config.mavlink_component_id)
+        self._encoder = Encoder(config.system_id, config.component_id)
         self._lock = threading.Lock()
         self._pending: _Pending | None = None
         self._last_sent = -1e9
@@ -144,7 +146,7 @@ class MavlinkLink:
             self._write(self._transport)
         else:
             if self._transport is not None:
-                self._told.fault(f'{self._config.mavlink_url}: nobody has sent there yet')
+                self._told.fault(f'{self._config.url}: nobody has sent there yet')
             self._refuse_pending()
         self._rest()
 
@@ -159,7 +161,7 @@ class MavlinkLink:
             self._transport.close()
             self._transport = None
         cause = 'mavlink_lost' if connected else 'mavlink_no_connection'
-        self._told.fault(f'{self._config.mavlink_url}: {error}')
+        self._told.fault(f'{self._config.url}: {error}')
         self._told.dropped(Drop(cause, str(error)))
         self._next_attempt = self._told.clock() + self._wait
         self._wait = min(2 * self._wait, LONGEST_WAIT)
@@ -168,7 +170,7 @@ class MavlinkLink:
         with self._lock:
             pending, self._pending = self._pending, None
         if pending is not None:
-            self._told.dropped(Drop('mavlink_not_connected', self._config.mavlink_url))
+            self._told.dropped(Drop('mavlink_not_connected', self._config.url))
 
     def _write(self, transport: Transport) -> None:
         self._flush(transport)
@@ -182,7 +184,7 @@ class MavlinkLink:
         if now >= self._next_beat:
             self._next_beat = now + PERIOD
             self._put(transport, self._encoder.heartbeat(
-                now - self._last_sent <= self._config.stall))
+                now - self._last_sent <= self._stall))
             self._put(transport, self._encoder.timesync(0, self._sync.ask(time.time_ns())))
         self._send_pending(transport)
 
@@ -200,7 +202,7 @@ class MavlinkLink:
         with self._lock:
             pending, self._pending = self._pending, None
         now = self._told.clock()
-        if now - pending.queued > self._config.stall:
+        if now - pending.queued > self._stall:
             self._told.dropped(Drop('mavlink_late', f'waited {now - pending.queued:.2f} s'))
             return
         for message in self._messages(pending.sectors):
@@ -210,14 +212,14 @@ class MavlinkLink:
 
     def _messages(self, sectors: ObstacleSectors) -> list[bytes]:
         time_usec = self._sync.time_usec(sectors.key.stamp)
-        points = [] if not self._config.mavlink_send_3d else self._encoder.obstacle_points(
-            sectors, time_usec, self._config.mavlink_points_3d)
+        points = [] if not self._config.send_3d else self._encoder.obstacle_points(
+            sectors, time_usec, self._config.points_3d)
         # The points first: ArduPilot forgets all sectors at the first of them.
         return [*points, self._encoder.obstacle_distance(sectors, time_usec)]
 
     def _values(self, transport: Transport, now: float) -> dict[str, object]:
         offset = self._sync.offset
-        return {'url': self._config.mavlink_url,
+        return {'url': self._config.url,
                 'autopilot_heard_s': 'never' if self._heard_at is None
                 else f'{now - self._heard_at:.1f}',
                 'clock_offset_s': 'unknown' if offset is None else f'{offset / 1e9:.4f}'}

@@ -1,6 +1,8 @@
 """Stage 4 as a node: range on the current frame's grid, its sigma, and the cloud."""
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from sphstereo_ros.core.cloud import point_cloud
@@ -45,10 +47,11 @@ class RangeOutputs:
         return {'metric': measured.is_metric, 'coverage': f'{known:.3f}', **measured.quality}
 
 
-def build(shell: Shell) -> StageComponent[AlignedWindow, RangeImage]:
-    """Make the component."""
+def build(shell: Shell, then: Callable[[RangeImage, float], None] | None = None
+          ) -> StageComponent[AlignedWindow, RangeImage]:
+    """Make the component; `then` takes (range image, arrival) in place of a subscriber."""
     return StageComponent(shell, 'spherical_stereo', AlignedWindow, 'pairs/aligned',
-                          SphericalStereo, RangeOutputs(shell).deliver,
+                          SphericalStereo, RangeOutputs(shell).deliver, then,
                           colour=shell.config.points.colour)
 
 

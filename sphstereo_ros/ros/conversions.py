@@ -46,7 +46,8 @@ __all__ = [
     'MessageFactory', 'Status', 'WindowGeometry', 'cloud_message', 'compressed_message',
     'decode_frame', 'depth_message', 'diagnostic_message', 'frame_key', 'frame_message', 'header',
     'image_message', 'imu_sample', 'nanoseconds', 'odometry_message', 'odometry_sample',
-    'read_cloud', 'read_depth', 'read_window', 'time_message', 'twist_sample', 'window_message',
+    'read_cloud', 'read_depth', 'read_stamped_depth', 'read_window', 'time_message',
+    'twist_sample', 'window_message',
 ]
 
 FloatArray = NDArray[np.float64]
@@ -228,6 +229,20 @@ def odometry_message(make: MessageFactory, window: FrameWindow) -> Any:
                   covariance=pose_covariance.reshape(-1)),
         twist=make('geometry_msgs/msg/TwistWithCovariance', twist=twist,
                    covariance=twist_covariance.reshape(-1)))
+
+
+# Depth
+
+def read_stamped_depth(msg: Any) -> tuple[FrameKey, NDArray[np.float32]] | Drop:
+    """Read depth/image or depth/sigma: what names the frame, and (H, W) float32 metres.
+
+    Causes: invalid_stamp, and those of `read_depth`.
+    """
+    drop = bad_stamp(msg.header)
+    if drop is not None:
+        return drop
+    pixels = read_depth(msg)
+    return pixels if isinstance(pixels, Drop) else (frame_key(msg.header), pixels)
 
 
 # Point clouds

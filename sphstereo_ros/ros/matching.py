@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphstereo_ros.core.config import Config
-from sphstereo_ros.core.frames import Drop, Frame, FrameKey, FrameWindow, Reference
+from sphstereo_ros.core.frames import (
+    Drop,
+    Frame,
+    FrameKey,
+    FrameWindow,
+    RangeImage,
+    Reference,
+)
 from sphstereo_ros.core.pairing import MAX_BYTES, farthest_reference, frame_bytes
 from sphstereo_ros.ros.conversions import WindowGeometry, read_covariance
 
@@ -130,3 +137,44 @@ class Covariances:
         if told is None or pose.covariance is not None:
             return reference
         return replace(reference, pose=replace(pose, covariance=told))
+
+
+Pixels = NDArray[np.float32]
+
+
+class RangeMatcher:
+    """Joins depth/image and depth/sigma of the same frame.
+
+    What is older than a frame that is complete, or too many newer ones, has lost its other half:
+    a Drop `range_missing` or `sigma_missing`.
+    """
+
+    def __init__(self) -> None:
+        self._ranges: OrderedDict[FrameKey, tuple[Pixels, float]] = OrderedDict()
+        self._sigmas: OrderedDict[FrameKey, tuple[Pixels, float]] = OrderedDict()
+
+    def add_range(self, key: FrameKey, pixels: Pixels,
+                  arrival: float) -> list[tuple[RangeImage | Drop, float]]:
+        """Take depth/image; gives what is decided now, each with its time of arrival."""
+        self._ranges[key] = pixels, arrival
+        return self._settle(key)
+
+    def add_sigma(self, key: FrameKey, pixels: Pixels,
+                  arrival: float) -> list[tuple[RangeImage | Drop, float]]:
+        """Take depth/sigma; as `add_range`."""
+        self._sigmas[key] = pixels, arrival
+        return self._settle(key)
+
+    def _settle(self, key: FrameKey) -> list[tuple[RangeImage | Drop, float]]:
+        halves = (self._ranges, 'sigma_missing'), (self._sigmas, 'range_missing')
+        complete = key in self._ranges and key in self._sigmas
+        decided: list[tuple[RangeImage | Drop, float]] = []
+        for waiting, cause in halves:
+            lost = list(waiting)[:list(waiting).index(key)] if complete \
+                else list(waiting)[:-MAX_PENDING]
+            decided += [(Drop(cause, f'of frame {old.stamp}'), waiting.pop(old)[1])
+                        for old in lost]
+        if complete:
+            pixels, arrival = self._ranges.pop(key)
+            decided.append((RangeImage(key, pixels, self._sigmas.pop(key)[0], True), arrival))
+        return decided

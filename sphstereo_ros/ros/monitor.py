@@ -79,6 +79,11 @@ class Monitor:
             self._latencies.append(self._last_out - arrival)
             self._values.update(values or {})
 
+    def idle(self) -> None:
+        """Say that something came that nobody wants: no input and no output is no stall."""
+        with self._lock:
+            self._last_in = self._last_out = self.clock()
+
     def fault(self, text: str) -> None:
         """Say what keeps this part from working, from now on; '' = nothing."""
         with self._lock:

@@ -19,7 +19,7 @@ NODE_PARAMETERS: dict[str, tuple[str, ...]] = {
                          'pairing.'),
     'obstacle_detection': ('obstacles.', 'camera.', 'range.'),
     'pipeline': ('camera.', 'baseline.', 'pairing.', 'pose.', 'alignment.', 'calibration.',
-                 'stereo.', 'range.', 'points.'),
+                 'stereo.', 'range.', 'points.', 'obstacles.'),
     'bag_replay': ('replay.',),
 }
 # Names that ROS itself declares on a node.

@@ -91,6 +91,7 @@ class Shell:
         self.mask = read_mask(self.config.camera.mask)
         self._monitors: list[Monitor] = []
         self._workers: list[Worker] = []
+        self._last_actions: list[Callable[[], None]] = []
         self._diagnostics = self.node.create_publisher(
             message_class('diagnostic_msgs/msg/DiagnosticArray'), '/diagnostics', qos.RESULT)
         # A steady clock: simulated time may stand still.
@@ -117,6 +118,10 @@ class Shell:
                         partial(self.failed, monitor), capacity)
         self._workers.append(worker)
         return worker
+
+    def at_end(self, action: Callable[[], None]) -> None:
+        """Call `action` when the node ends."""
+        self._last_actions.append(action)
 
     def output(self, kind: str, topic: str, profile: QoSProfile = qos.RESULT) -> Output:
         """Publish messages of `kind` (package/msg/Type) on `topic`."""
@@ -164,6 +169,8 @@ class Shell:
         """End the threads and the node."""
         for worker in self._workers:
             worker.stop()
+        for action in self._last_actions:
+            action()
         self.node.destroy_node()
 
 
