@@ -21,7 +21,7 @@ STAGES = ['frame_pairing', 'pose_stabilisation', 'motion_alignment', 'spherical_
 
 
 def test_there_are_configs() -> None:
-    assert [c.name for c in CONFIGS] == ['default.yaml', 'live.yaml',
+    assert [c.name for c in CONFIGS] == ['binocular.yaml', 'default.yaml', 'live.yaml',
                                          'live_checked.yaml', 'paper.yaml']
 
 
@@ -131,6 +131,25 @@ def test_obstacles_may_be_left_out() -> None:
     started = nodes(performed('pipeline_launch.py', params_file=str(CONFIGS[0]),
                               obstacles='false'))
     assert [n['executable'] for n in started[:-2]] == STAGES[:-1]
+
+
+@pytest.mark.usefixtures('launch_modules')
+def test_binocular_launch(tmp_path: Path) -> None:
+    file = tmp_path / 'rig.yaml'
+    file.write_text('/**:\n  ros__parameters:\n    camera.top: {roll: 0.5}\n'
+                    '    baseline: {length: 0.5, direction: [0.0, 3.0, 4.0]}\n')
+    default = performed('binocular_launch.py')
+    assert Path(dict(default[0].kwargs['launch_arguments'])['params_file']).is_file()
+    include, top, optical = performed('binocular_launch.py', params_file=str(file),
+                                      top_frame='upper', bottom_frame='lower')
+    assert Path(include.args[0].args[0]).is_file()
+    given = dict(include.kwargs['launch_arguments'])
+    assert (given['params_file'], given['camera_frame']) == (str(file), 'lower')
+    link, frame = arguments(top.kwargs), arguments(optical.kwargs)
+    assert [float(link[f'--{n}']) for n in ('x', 'y', 'z', 'roll', 'pitch', 'yaw')] == \
+        pytest.approx([0.0, 0.3, 0.4, 0.5, 0.0, 0.0])
+    assert (link['--frame-id'], link['--child-frame-id']) == ('camera_link', 'top_camera_link')
+    assert (frame['--frame-id'], frame['--child-frame-id']) == ('top_camera_link', 'upper')
 
 
 def arguments(node: dict[str, Any]) -> dict[str, str]:

@@ -13,7 +13,7 @@ from sphstereo_ros.replay.offline import TOPICS, OfflineRun, wanted_topics
 from sphstereo_ros.replay.output import McapOutput
 from sphstereo_ros.replay.parameter_files import load_config
 from sphstereo_ros.replay.records import BadInput
-from sphstereo_ros.replay.sources import image_topic, open_source
+from sphstereo_ros.replay.sources import image_topics, open_source
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -56,14 +56,14 @@ def main(arguments: argparse.Namespace) -> int:
     config = load_config(arguments.params, arguments.overrides)
     topics = wanted_topics(arguments.topics)
     source = open_source(arguments.input, arguments.fps)
-    topic = image_topic(source, arguments.topic)
+    images = image_topics(source, config.pairing.mode == 'binocular', arguments.topic)
     path = output_path(arguments.out, arguments.input, '_depth.mcap')
     interrupt_on_signals()
     interrupted = False
     with McapOutput(path) as output:
-        run = OfflineRun(config, topic, output, topics)
+        run = OfflineRun(config, images, output, topics)
         # No bar where nobody watches.
-        with tqdm(total=source.count([topic]), unit='frame', disable=None) as progress:
+        with tqdm(total=source.count(list(images)), unit='frame', disable=None) as progress:
             try:
                 run.process(source, progress.update)
             except KeyboardInterrupt:

@@ -26,6 +26,7 @@ from .frames import (
 )
 from .history import PoseHistory, with_baseline
 from .paper import window_ratio_direction
+from .photometric import matched
 from .relative_pose import Correspondences, PoseEstimate, epipolar_residuals, refine
 from .stabilisation import reduced, with_length
 from .warp import PolarGrid
@@ -36,6 +37,8 @@ _MARGIN, _WRAP = 8, 8
 # By how much a length may differ from the one believed before the reference is followed anew, and
 # how uncertain it may be, as a share of it.
 _SURPRISE, _UNSURE = 0.03, 0.01
+# A rig that moved by less, as a share of the distance of its cameras, learns nothing from it.
+_SHORT = 0.3
 _LIKELY = 0.3  # least length of a chain, as a share of what is believed
 
 
@@ -48,6 +51,7 @@ class Aligner:
         self._history = PoseHistory()
         # Where no sensor measures them, all steps between frames are taken as equally long.
         self._assumes_steps = config.baseline.source in ('fixed', 'speed')
+        self._believes_rig = not config.calibration.each_pair
 
     def warm_up(self) -> None:
         """Compile what `process` needs."""
@@ -63,10 +67,13 @@ class Aligner:
         The nearest starts from where stage 2 put it. Farther ones start at the end of the poses
         found for earlier windows, where these lead there.
 
+        Another camera on the same rig is where it was calibrated to be, unless
+        `calibration.each_pair`; then farther ones are those of the moving rig.
+
         If none is left, the nearest one's failure is returned: `alignment_failed`.
         """
         if self.config.method == 'paper':
-            done = [self._by_window_ratio(window.current, r) for r in window.references]
+            done = self._window_by_ratio(window)
         else:
             done = self._refined_window(window)
         good = tuple(r for r in done if isinstance(r, Reference))
@@ -80,21 +87,36 @@ class Aligner:
         height = self.config.working_height
         return image if image.shape[0] < 1.3 * height else reduced(image, height)
 
+    def _window_by_ratio(self, window: StabilisedWindow) -> list[Reference | Drop]:
+        rig: list[Reference | Drop] = [r for r in window.references
+                                       if self._is_believed(window.current, r)]
+        return rig or [self._by_window_ratio(window.current, r) for r in window.references]
+
     def _by_window_ratio(self, current: Frame, reference: Reference) -> Reference | Drop:
         pose = window_ratio_direction(self._reduced(reference.frame.image),
                                       self._reduced(current.image), reference.pose)
         return pose if isinstance(pose, Drop) else replace(reference, pose=pose)
 
+    def _is_believed(self, current: Frame, reference: Reference) -> bool:
+        return self._believes_rig and reference.is_beside(current)
+
     def _refined_window(self, window: StabilisedWindow) -> list[Reference | Drop]:
+        rig = [r for r in window.references if self._is_believed(window.current, r)]
+        if len(rig) == len(window.references):
+            return list(rig)
         key = window.current.key
         self._history.begin(key)
         image = self._reduced(window.current.image)
         grid = PolarGrid(min(self.config.working_height, image.shape[0]), _MARGIN, _WRAP)
         view: CurrentView | None = None
         done: list[Reference | Drop] = []
-        for reference in window.references:
+        beside = window.references[0].is_beside(window.current)
+        for reference in rig:
+            done.append(reference)
+            view = self._told_by_rig(image, reference, grid)
+        for reference in window.references[len(rig):]:
             found = self._nearest(image, reference, grid) if view is None \
-                else self._farther(view, key, reference)
+                else self._farther(view, key, reference, beside)
             if isinstance(found, Drop):
                 done.append(found)
                 continue
@@ -120,11 +142,23 @@ class Aligner:
             view = view.taught(points, index, pose)
         return view, pose
 
-    def _farther(self, view: CurrentView, current: FrameKey,
-                 reference: Reference) -> tuple[CurrentView, RelativePose] | Drop:
+    def _told_by_rig(self, current: Image8, reference: Reference, grid: PolarGrid) -> CurrentView:
+        """The view with the ranges that another camera tells."""
+        pose = reference.pose
+        view = current_view(current, pose.direction, grid, self.config.max_points)
+        points, index = followed(view, matched(self._reduced(reference.frame.image), current),
+                                 pose)
+        residual = np.abs(epipolar_residuals(pose.rotation, -pose.direction, points))
+        good = self._beside_mask(points) & (residual < view.grid.pixel)
+        return view.taught(points[good], index[good], pose)
+
+    def _farther(self, view: CurrentView, current: FrameKey, reference: Reference,
+                 rig: bool = False) -> tuple[CurrentView, RelativePose] | Drop:
         """Refine from the end of a chain, with the features of the nearest reference's view.
 
         An assumed length gives way to the one that ranges by nearer references tell.
+
+        rig : the nearest reference is another camera: an assumed length has to give way
         """
         pose = self._predicted(current, reference)
         for _ in range(2 if self.config.iterations else 0):
@@ -134,15 +168,19 @@ class Aligner:
             points, index, estimate = found
             refined = with_length(estimate, reference.pose)
             told = length_by_ranges(view, points, index, refined) if self._assumes_steps else None
+            if told is None and rig and self._assumes_steps:
+                break
             if told is None:
                 return view.taught(points, index, refined), refined
             length, sigma = told
             refined = with_baseline(refined, length)
             if abs(length - pose.baseline) < _SURPRISE * length and sigma < _UNSURE * length:
+                if rig and length < _SHORT * view.baseline:
+                    return Drop('baseline_too_short', f'{length:.4f} m')
                 return view.taught(points, index, refined), refined
             pose = refined
-        return Drop('alignment_failed', 'ranges tell no length') if self.config.iterations \
-            else (view, pose)
+        return Drop('alignment_failed', 'ranges tell no length') \
+            if self.config.iterations or (rig and self._assumes_steps) else (view, pose)
 
     def _predicted(self, current: FrameKey, reference: Reference) -> RelativePose:
         """Where the poses of earlier windows put the reference, or else stage 2."""

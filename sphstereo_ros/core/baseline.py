@@ -239,6 +239,14 @@ class MotionPriors:
             return Drop('imu_invalid', 'neither orientation nor angular velocity')
         return self._imu.add(sample)
 
+    def share_samples(self, priors: MotionPriors) -> None:
+        """Know the samples that `priors` knows, from now on and so far."""
+        self._odometry, self._twist, self._imu = priors._odometry, priors._twist, priors._imu
+
+    def samples_came(self) -> None:
+        """Samples were added to what is shared."""
+        self._forget_places()
+
     def _added(self, track: Track[S], sample: S) -> Drop | None:
         """Insert a sample; what it adds to the past changes places there."""
         if track.newest is not None and sample.stamp <= track.newest:
@@ -286,6 +294,24 @@ class MotionPriors:
         if pose.baseline < self._config.minimum:
             return Drop('baseline_too_short', f'{pose.baseline:.4f} m')
         return pose
+
+    def moved(self, stamp: int, until: int) -> RelativePose | None:
+        """Where the camera was (or will be) at `stamp`, in its own optical frame at `until`.
+
+        None where neither odometry nor twist tells; then rotation alone, where an IMU does.
+        """
+        if stamp == until:
+            return None
+        first, last = min(stamp, until), max(stamp, until)
+        pose = self._by_odometry(first, last) or self._by_twist(first, last, None)
+        if pose is None:
+            turn = self._imu_turn(first, last)
+            if turn is None:
+                return None
+            pose = camera_pose(BaseMotion(turn, np.zeros(3)), self._mount)
+        if stamp == first:
+            return pose
+        return RelativePose(pose.rotation.T, -pose.rotation.T @ pose.position)
 
     def distances(self, later: int, earlier: Iterable[int]) -> Iterator[float]:
         """Metres between the camera at `later` and at each of `earlier` (ns, newest first).

@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from .alignment import Aligner
+from .binocular import BinocularPairer
 from .cloud import point_cloud
 from .config import Config
 from .frames import (
@@ -23,6 +24,7 @@ from .motion import ImuSample, OdometrySample, TwistSample
 from .pairing import Pairer
 from .stabilisation import Stabiliser
 from .stereo import SphericalStereo
+from .synchronisation import Side
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,8 @@ class Chain:
 
     def __init__(self, config: Config, mask: Image8 | None = None) -> None:
         self.config = config
-        self.pairer = Pairer(config)
+        self.pairer = BinocularPairer(config, mask) if config.pairing.mode == 'binocular' \
+            else Pairer(config)
         self.stabiliser = Stabiliser(config, mask)
         self.aligner = Aligner(config, mask)
         self.stereo = SphericalStereo(config, mask)
@@ -58,6 +61,12 @@ class Chain:
     def add_frame(self, frame: Frame) -> list[StageResults | Drop]:
         """Take the next frame; returns what became of every window that is complete now."""
         return self._process(self.pairer.add_frame(frame))
+
+    def add_view(self, side: Side, frame: Frame) -> list[StageResults | Drop]:
+        """Take the next frame of one of two cameras (`pairing.mode` binocular)."""
+        if not isinstance(self.pairer, BinocularPairer):
+            raise ValueError('pairing.mode is monocular')
+        return self._process(self.pairer.add_view(side, frame))
 
     def add_odometry(self, sample: OdometrySample) -> list[StageResults | Drop]:
         """Take a sample; frames may have waited for it."""
@@ -86,7 +95,7 @@ class Chain:
         measured = self.stereo.process(aligned)
         if isinstance(measured, Drop):
             return measured
-        cloud = point_cloud(measured, aligned.current, self.config) if measured.is_metric else None
+        cloud = point_cloud(measured, aligned.current, self.config) if measured.is_placed else None
         return StageResults(paired, stabilised, aligned, measured, cloud)
 
     def _process(self, windows: list[PairedWindow | Drop]) -> list[StageResults | Drop]:

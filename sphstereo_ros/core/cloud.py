@@ -10,7 +10,7 @@ from .camera import Equirectangular
 from .config import CameraConfig, Config
 from .frames import Frame, PointCloud, RangeImage
 from .jit import kernel
-from .rotations import mount
+from .rotations import mount, mounted_on
 
 MAX_BYTES = 8_000_000
 BYTES_PER_POINT = 20  # x, y, z, colour or intensity, sigma
@@ -36,20 +36,32 @@ def point_cloud(range_image: RangeImage, frame: Frame, config: Config) -> PointC
     """Points of the finite ranges, every `points.stride`-th pixel, in `base_link`.
 
     frame : the current frame, for intensity or colour
+    Raises ValueError where it is not known which camera measured.
     """
+    camera = _placed(range_image, config.camera)
     height = range_image.range.shape[0]
     stride = config.points.stride or default_stride(height)
     thin = (slice(None, None, stride), slice(None, None, stride))
     r = np.ascontiguousarray(range_image.range[thin]).ravel()
-    position = mount(config.camera).position.astype(np.float32)
+    position = mount(camera).position.astype(np.float32)
     xyz, known = np.empty((r.size, 3), np.float32), np.empty(r.size, np.intp)
-    count = _place(r, _bearings(height, stride, config.camera), position, xyz, known)
+    count = _place(r, _bearings(height, stride, camera), position, xyz, known)
     known = known[:count]
     sigma = range_image.sigma[thin].ravel()[known]
     if config.points.colour and frame.colour is not None:
         bgr = frame.colour[thin].reshape(-1, 3)[known]
         return PointCloud(range_image.key, xyz[:count], sigma, bgr=bgr)
     return PointCloud(range_image.key, xyz[:count], sigma, frame.image[thin].ravel()[known])
+
+
+def _placed(range_image: RangeImage, camera: CameraConfig) -> CameraConfig:
+    """The mount of the camera that measured."""
+    pose = range_image.camera
+    if pose is None:
+        raise ValueError('it is not known which camera measured')
+    if not pose.position.any():
+        return camera
+    return mounted_on(camera, pose.rotation, pose.position)
 
 
 @kernel

@@ -121,8 +121,16 @@ class BaselineConfig:
 class PairingConfig:
     """Which frames make a window."""
 
-    mode: str = _p('pairing.mode', 'monocular', 'one moving camera', choices=('monocular',),
-                   runtime=False)
+    mode: str = _p('pairing.mode', 'monocular', 'monocular: one moving camera, on image; '
+                   'binocular: two, on top/image and bottom/image',
+                   choices=('monocular', 'binocular'), runtime=False)
+    tolerance: float = _p('pairing.tolerance', 0.025, 'binocular: how far the stamps of a pair '
+                          'may be apart; less than half the time between frames', unit='s',
+                          low=0.0, high=10.0)
+    fallback: bool = _p('pairing.fallback', False, 'binocular: where one camera is silent, the '
+                        'other continues as monocular', runtime=False)
+    motion: bool = _p('pairing.motion', True, 'binocular: earlier frames of the bottom camera are '
+                      'references, too, where it moved')
     intervals: tuple[int, ...] = _p('pairing.intervals', (1, 4, 10),
                                     'references, frames back', low=1, high=100)
     baselines: tuple[float, ...] = _p('pairing.baselines', (0.0,), 'references by distance '
@@ -180,9 +188,12 @@ class AlignmentConfig:
 class CalibrationConfig:
     """The alignment of two cameras."""
 
-    pairs: int = _p('calibration.pairs', 0, 'binocular: estimate camera.top.* from so many pairs '
-                    'before depth is published; 0 = camera.top.* as given', low=0, high=1000,
-                    runtime=False)
+    pairs: int = _p('calibration.pairs', 0, 'binocular: estimate camera.top.* from the first '
+                    'pairs before depth is published, so many at most; 0 = camera.top.* as '
+                    'given', low=0, high=1000, runtime=False)
+    each_pair: bool = _p('calibration.each_pair', False, 'binocular: estimate rotation and '
+                         'direction of each pair by itself, for cameras that are not synchronised '
+                         'or not rigid; noisier')
     online: bool = _p('calibration.online', False, 'binocular: follow slow drift of camera.top.*')
     time_constant: float = _p('calibration.time_constant', 20.0, 'of the filter that follows '
                               'drift', unit='s', low=0.1, high=1e6)
@@ -354,6 +365,10 @@ def _check_together(config: Config, given: Mapping[str, Value]) -> None:
         raise ParameterError(f'baseline.direction: {list(direction)} is no direction: needs x, y, '
                              'z, not all zero')
     baselines = config.pairing.baselines
+    if (baselines != (0.0,) and config.pairing.mode == 'binocular'
+            and config.baseline.source == 'fixed'):
+        raise ParameterError('pairing.baselines: baseline.length is that between the cameras; '
+                             'how far the rig moves, baseline.source must tell')
     if 0.0 in baselines and len(baselines) > 1:
         raise ParameterError('pairing.baselines: 0 (unused) cannot stand beside other baselines')
     if baselines != (0.0,) and 'pairing.intervals' in given:

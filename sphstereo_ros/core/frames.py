@@ -81,10 +81,16 @@ class Reference:
     frame: Frame
     pose: RelativePose
 
+    def is_beside(self, current: Frame) -> bool:
+        """Whether it is of another camera than `current`: two on one rig, whose relative pose is
+        calibrated.
+        """
+        return self.frame.key.frame_id != current.key.frame_id
+
 
 @dataclass(frozen=True)
 class FrameWindow:
-    """One current frame and its references, nearest first."""
+    """One current frame and its references, nearest first; another camera's before all others."""
 
     current: Frame
     references: tuple[Reference, ...]
@@ -123,6 +129,8 @@ class RangeImage:
         confidently beyond the maximum, −Inf nearer than the minimum (REP-117)
     sigma : float32, one standard deviation of it, same unit; NaN where range is not finite
     moving : uint8, 255 = moves by itself; None where the matcher cannot tell
+    camera : pose of the camera in the frame of the one that `camera.mount` is for: of a top camera
+        that went on alone; None where it is not known which camera it is
     """
 
     key: FrameKey
@@ -131,6 +139,12 @@ class RangeImage:
     is_metric: bool
     quality: dict[str, Any] = field(default_factory=dict)
     moving: Image8 | None = None
+    camera: RelativePose | None = field(default_factory=RelativePose)
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether its points have a place on the vehicle: metres, and a camera that is known."""
+        return self.is_metric and self.camera is not None
 
 
 @dataclass(frozen=True)

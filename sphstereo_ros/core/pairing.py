@@ -47,6 +47,8 @@ class Pairer:
     message. Drops of sensor messages come on top; their causes begin with the sensor's name.
     """
 
+    max_waiting = MAX_WAITING
+
     def __init__(self, config: Config) -> None:
         self._priors = MotionPriors(config)
         self._waiting: deque[Frame] = deque()
@@ -60,6 +62,16 @@ class Pairer:
         self._config = config.pairing
         self._priors.configure(config)
         self._trim()
+
+    @property
+    def values(self) -> dict[str, object]:
+        """What /diagnostics tells of it."""
+        return {}
+
+    @property
+    def warning(self) -> str:
+        """What is amiss, empty if nothing is."""
+        return ''
 
     def add_frame(self, frame: Frame) -> list[Outcome]:
         """Take the next frame of the camera."""
@@ -91,12 +103,21 @@ class Pairer:
         """Take a sample of an IMU."""
         return self._after(self._priors.add_imu(sample))
 
+    def share_samples(self, pairer: Pairer) -> None:
+        """Know what `pairer` is told by sensors, from now on and so far."""
+        self._priors.share_samples(pairer._priors)
+
+    def samples_came(self) -> list[Outcome]:
+        """Go on after a sample that was shared; gives the frames that waited for it."""
+        self._priors.samples_came()
+        return self._release()
+
     def flush(self) -> list[Outcome]:
         """Nothing more is to come for now: what still waits is dropped."""
         out: list[Outcome] = []
         while self._waiting:
             frame = self._waiting.popleft()
-            sensor = self._priors.waits_for(frame.key.stamp)
+            sensor = self._priors.waits_for(self._needed(frame))
             out.append(Drop(f'{sensor}_missing', 'none came while the frame waited') if sensor
                        else self._window(frame))
             self._keep(frame)
@@ -117,12 +138,16 @@ class Pairer:
 
     def _release(self) -> list[Outcome]:
         out: list[Outcome] = []
-        while self._waiting and (len(self._waiting) > MAX_WAITING
-                                 or not self._priors.waits_for(self._waiting[0].key.stamp)):
+        while self._waiting and (len(self._waiting) > self.max_waiting
+                                 or not self._priors.waits_for(self._needed(self._waiting[0]))):
             frame = self._waiting.popleft()
             out.append(self._window(frame))
             self._keep(frame)
         return out
+
+    def _needed(self, frame: Frame) -> int:
+        """Until when sensors must have told, before `frame` is paired."""
+        return frame.key.stamp
 
     def _discontinuity(self, frame: Frame) -> Drop | None:
         """Why `frame` does not continue what came before it, if it does not."""
@@ -146,8 +171,7 @@ class Pairer:
         """Pair `frame` with earlier ones, nearest first, unless the last window is too recent."""
         if self._is_early(frame):
             return Drop('rate_limit', 'kept as a reference')
-        found = self._by_distance(frame) if by_distance(self._config) \
-            else self._by_interval(frame)
+        found = self._earlier(frame)
         drops = [pose for _, pose in found if isinstance(pose, Drop)]
         references = [Reference(reference, pose) for reference, pose in found
                       if isinstance(pose, RelativePose)]
@@ -156,6 +180,9 @@ class Pairer:
             self._paired = frame.key.stamp
             return PairedWindow(frame, tuple(references))
         return drops[0] if drops else Drop('no_reference', 'no earlier frame is far enough back')
+
+    def _earlier(self, frame: Frame) -> list[tuple[Frame, RelativePose | Drop]]:
+        return self._by_distance(frame) if by_distance(self._config) else self._by_interval(frame)
 
     def _is_early(self, frame: Frame) -> bool:
         rate, last = self._config.max_rate, self._paired

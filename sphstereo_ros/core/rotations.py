@@ -5,7 +5,7 @@ Quaternions are (x, y, z, w), as in ROS messages; matrices act on column vectors
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -125,6 +125,16 @@ def mount(camera: CameraConfig) -> Mount:
     base_from_link = matrix_from_rpy(camera.mount_roll, camera.mount_pitch, camera.mount_yaw)
     position = np.array([camera.mount_x, camera.mount_y, camera.mount_z])
     return Mount(base_from_link @ OPTICAL_FROM_LINK.T, position)
+
+
+def mounted_on(camera: CameraConfig, rotation: FloatArray, position: FloatArray) -> CameraConfig:
+    """The camera at a pose (3, 3), (3,) in the optical frame of `camera`: its own mount."""
+    first = mount(camera)
+    x, y, z = (float(v) for v in first.position + first.rotation @ position)
+    link = first.rotation @ rotation @ OPTICAL_FROM_LINK
+    roll, pitch, yaw = (float(angle) for angle in rpy_from_matrix(link))
+    return replace(camera, mount_x=x, mount_y=y, mount_z=z, mount_roll=roll, mount_pitch=pitch,
+                   mount_yaw=yaw)
 
 
 def top_rotation(camera: CameraConfig) -> FloatArray:

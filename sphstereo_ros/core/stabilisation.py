@@ -97,6 +97,7 @@ class Stabiliser:
         self._history = PoseHistory()
         # Where no sensor measures them, all steps between frames are taken as equally long.
         self._assumes_steps = config.baseline.source in ('fixed', 'speed')
+        self._believes_rig = not config.calibration.each_pair
         self._stood_still: FrameKey | None = None
 
     def warm_up(self) -> None:
@@ -108,8 +109,10 @@ class Stabiliser:
     def process(self, window: PairedWindow) -> StabilisedWindow | Drop:
         """Give every reference its rotation and direction; the baselines' lengths stay.
 
-        The nearest is estimated from the images. Where the poses found for earlier windows lead
-        to a farther one, it is predicted from them: stage 3 refines it.
+        Another camera on the same rig is where it was calibrated to be, unless
+        `calibration.each_pair`. The nearest other is estimated from the images. Where the poses
+        found for earlier windows lead to a farther one, it is predicted from them: stage 3 refines
+        it.
 
         Where lengths are assumed, nothing older than a hover is a reference: the way from there is
         shorter than assumed.
@@ -120,6 +123,9 @@ class Stabiliser:
         done: list[Reference | Drop] = []
         for reference in window.references:
             key = reference.frame.key
+            if self._believes_rig and reference.is_beside(window.current):
+                done.append(reference)
+                continue
             if self._stood_still is not None and key < self._stood_still:
                 done.append(Drop('no_parallax', 'a hover since then'))
                 continue

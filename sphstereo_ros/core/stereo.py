@@ -22,8 +22,10 @@ from .islands import far_islands
 from .joint import JointMatcher
 from .matching import matcher, stereo_grid
 from .moving import moving_parts, under_floor
+from .pair_matching import PairMatcher
 from .planes import on_planes
 from .range_memory import RangeMemory
+from .rig import Rig
 from .rotations import mount
 from .warp import aligned_pair
 
@@ -42,6 +44,10 @@ class SphericalStereo:
         if config.stereo.matcher in ('joint', 'joint_fast'):
             self._joint = JointMatcher(config.stereo.matcher, self._match,
                                        config.baseline.relative_sigma)
+        self._pair: PairMatcher | None = None
+        if config.pairing.mode == 'binocular' and config.stereo.matcher == 'joint':
+            self._pair = PairMatcher(self._match, config.baseline.relative_sigma)
+        self._rig = Rig(config.pairing.mode == 'binocular')
         self._memory = RangeMemory(config.stereo.memory)
         self._mask = mask
 
@@ -68,7 +74,12 @@ class SphericalStereo:
         if len({r.pose.is_metric for r in window.references}) != 1:
             return Drop('mixed_scale', 'some baselines of a window are metric, others are not')
         mask, moving = self._mask_of(height), None
-        if self._joint is not None:
+        camera = self._rig.camera(window)
+        first = window.references[0]
+        if self._pair is not None and len(window.references) == 1 \
+                and first.is_beside(window.current):
+            estimate = self._pair.measured(window.current, first)
+        elif self._joint is not None:
             estimate, moving = self._remembered(self._joint, window, mask)
         else:
             estimate = fuse([self._measure(window.current, r) for r in window.references])
@@ -76,7 +87,8 @@ class SphericalStereo:
         if self._joint is not None and window.is_metric:
             hidden = far_islands(r)
             r[hidden] = sigma[hidden] = np.nan
-        return RangeImage(window.current.key, r, sigma, window.is_metric, moving=moving)
+        return RangeImage(window.current.key, r, sigma, window.is_metric, moving=moving,
+                          camera=camera)
 
     def _remembered(self, joint: JointMatcher, window: AlignedWindow,
                     mask: Image8 | None) -> tuple[InverseRange, Image8]:

@@ -5,9 +5,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+from sphstereo_ros.core.binocular import BinocularPairer
 from sphstereo_ros.core.config import Config
-from sphstereo_ros.core.frames import Drop, FrameKey, PairedWindow
+from sphstereo_ros.core.frames import Drop, Frame, FrameKey, PairedWindow
 from sphstereo_ros.core.pairing import Outcome, Pairer
+from sphstereo_ros.core.synchronisation import SIDES, Side
 from sphstereo_ros.ros import qos
 from sphstereo_ros.ros.conversions import (
     decode_frame,
@@ -58,12 +60,15 @@ class FramePairing:
         self._shell = shell
         self._then = then
         self._monitor = shell.monitor('frame_pairing')
-        self._pairer = Pairer(shell.config)
-        self._choice = TransportChoice()
+        binocular = shell.config.pairing.mode == 'binocular'
+        self._sides: tuple[Side | None, ...] = SIDES if binocular else (None,)
+        self._choices = {side: TransportChoice() for side in self._sides}
         self._arrivals: dict[FrameKey, float] = {}
         self._frames = shell.output('sensor_msgs/msg/Image', 'frames')
         self._pairs = WindowOutput(shell, 'pairs')
-        self._worker = shell.worker('frame_pairing', self._monitor, FRAMES_WAITING)
+        self._worker = shell.worker('frame_pairing', self._monitor,
+                                    FRAMES_WAITING * len(self._sides))
+        self._pairer = self._binocular() if binocular else Pairer(shell.config)
 
     def warm_up(self) -> None:
         """Nothing here is compiled."""
@@ -72,9 +77,11 @@ class FramePairing:
         """Take images and motion from the graph."""
         inputs = [('sensor_msgs/msg/Image', 'image'),
                   ('sensor_msgs/msg/CompressedImage', 'image/compressed')]
-        for kind, topic in inputs:
-            self._shell.input(kind, topic, partial(self._take_image, topic), self._monitor,
-                              qos.IMAGE_INPUT)
+        for side in self._sides:
+            for kind, name in inputs:
+                topic = f'{side}/{name}' if side else name
+                self._shell.input(kind, topic, partial(self._take_image, side, topic),
+                                  self._monitor, qos.IMAGE_INPUT)
         for kind, topic, read, add in (
                 ('nav_msgs/msg/Odometry', 'odometry', odometry_sample, self._pairer.add_odometry),
                 ('geometry_msgs/msg/TwistStamped', 'twist', twist_sample, self._pairer.add_twist),
@@ -86,23 +93,36 @@ class FramePairing:
         """Take new parameters between two frames."""
         self._worker.put(partial(self._pairer.configure, config))
 
-    def _take_image(self, topic: str, message: Any) -> None:
-        if not self._choice.accepts(topic, self._monitor.clock()):
+    def _binocular(self) -> BinocularPairer:
+        """Drift is measured in a thread of its own: frames do not wait for it."""
+        beside = self._shell.worker('calibration', self._monitor)
+        return BinocularPairer(self._shell.config, self._shell.mask, beside.put)
+
+    def _take_image(self, side: Side | None, topic: str, message: Any) -> None:
+        if not self._choices[side].accepts(topic, self._monitor.clock()):
             self._monitor.dropped(Drop('other_transport', f'{topic} repeats another topic'))
             return
         arrival = self._monitor.arrived()
-        self._worker.put_newest(partial(self._pair, topic, message, arrival))
+        self._worker.put_newest(partial(self._pair, side, topic, message, arrival))
 
-    def _pair(self, topic: str, message: Any, arrival: float) -> None:
+    def _pair(self, side: Side | None, topic: str, message: Any, arrival: float) -> None:
         config = self._shell.config
         frame = decode_frame(message, config.stereo.working_height, config.points.colour)
         if isinstance(frame, Drop):
-            self._choice.failed(topic)
+            self._choices[side].failed(topic)
             self._monitor.dropped(frame)
             return
+        self._publish(self._added(side, frame, arrival))
+
+    def _added(self, side: Side | None, frame: Frame, arrival: float) -> list[Outcome]:
+        pairer = self._pairer
+        if side is not None and isinstance(pairer, BinocularPairer):
+            frame = pairer.named(side, frame)
         self._frames.send(lambda: frame_message(make, frame))
         self._arrivals[frame.key] = arrival
-        self._publish(self._pairer.add_frame(frame))
+        if side is not None and isinstance(pairer, BinocularPairer):
+            return pairer.add_view(side, frame)
+        return pairer.add_frame(frame)
 
     def _take_sample(self, topic: str, read: Callable[[Any], Any],
                      add: Callable[[Any], list[Outcome]], message: Any) -> None:
@@ -123,6 +143,7 @@ class FramePairing:
             self._monitor.published(arrival, pose_values(window))
             if self._then is not None:
                 self._then(window, arrival)
+        self._monitor.tell(self._pairer.values, self._pairer.warning)
         while len(self._arrivals) > ARRIVALS_KEPT:
             del self._arrivals[next(iter(self._arrivals))]
 

@@ -35,8 +35,9 @@ class RangeOutputs:
         if measured.is_metric:
             self._depth.send(lambda: depth_message(make, key, measured.range))
             self._sigma.send(lambda: depth_message(make, key, measured.sigma))
-            self._points.send(lambda: cloud_message(
-                make, point_cloud(measured, window.current, self._shell.config)))
+            if measured.is_placed:
+                self._points.send(lambda: cloud_message(
+                    make, point_cloud(measured, window.current, self._shell.config)))
         else:
             self._relative.send(lambda: depth_message(make, key, measured.range))
         moving = measured.moving

@@ -2,15 +2,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from sphstereo_ros.core.binocular import BinocularPairer
 from sphstereo_ros.core.chain import Chain, StageResults
 from sphstereo_ros.core.config import Config
 from sphstereo_ros.core.frames import Drop, Frame, PairedWindow
 from sphstereo_ros.core.preview import colour_map
+from sphstereo_ros.core.synchronisation import Side
 from sphstereo_ros.replay.bag_messages import make
 from sphstereo_ros.replay.output import McapOutput
 from sphstereo_ros.replay.records import BadInput, Record, Source
@@ -80,14 +82,16 @@ class Summary:
 class OfflineRun:
     """Feeds records to the chain and writes what comes out.
 
-    topic : of the images; output : None to compute only; topics : what is written
+    images : topics of the images, and of which of two cameras each is
+    output : None to compute only; topics : what is written
     """
 
-    def __init__(self, config: Config, topic: str, output: McapOutput | None,
+    def __init__(self, config: Config, images: Mapping[str, Side | None],
+                 output: McapOutput | None,
                  topics: Collection[str] = DEFAULT_TOPICS) -> None:
         self.summary = Summary()
         self._config = config
-        self._topic = topic
+        self._images = dict(images)
         self._output = output
         self._topics = topics
         self._chain = Chain(config, read_mask(config.camera.mask))
@@ -103,11 +107,11 @@ class OfflineRun:
 
         What was computed is written even when this is interrupted.
         """
-        topics = [self._topic, *motion_topics(source)]
+        topics = [*self._images, *motion_topics(source)]
         try:
             for record in source.records(topics):
                 self._take(record)
-                if record.topic == self._topic:
+                if record.topic in self._images:
                     advance()
             self._pass_on(self._chain.pairer.flush())
         finally:
@@ -117,9 +121,9 @@ class OfflineRun:
 
     def _take(self, record: Record) -> None:
         message = record.message()
-        if record.topic == self._topic:
+        if record.topic in self._images:
             self.summary.frames += 1
-            self._take_image(message)
+            self._take_image(self._images[record.topic], message)
         elif isinstance(message, Drop):
             self._drop(message)
         else:
@@ -129,14 +133,20 @@ class OfflineRun:
             else:
                 self._pass_on(self._add_sample[record.topic](sample))
 
-    def _take_image(self, message: Any) -> None:
+    def _take_image(self, side: Side | None, message: Any) -> None:
         frame = message if isinstance(message, Drop) else decode_frame(
             message, self._config.stereo.working_height, self._config.points.colour)
         if isinstance(frame, Drop):
             self._drop(frame)
             return
+        pairer = self._chain.pairer
+        if side is not None and isinstance(pairer, BinocularPairer):
+            frame = pairer.named(side, frame)
         self._write('/frames', frame.key.stamp, partial(self._frame, frame))
-        self._pass_on(self._chain.pairer.add_frame(frame))
+        if side is not None and isinstance(pairer, BinocularPairer):
+            self._pass_on(pairer.add_view(side, frame))
+        else:
+            self._pass_on(pairer.add_frame(frame))
         self._stamp = frame.key.stamp
         if abs(self._stamp - self._reported) >= SECOND:
             self._reported = self._stamp

@@ -4,13 +4,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from sphstereo_ros.core.frames import Drop
+from sphstereo_ros.core.synchronisation import SIDES, Side
 from sphstereo_ros.replay.bags import bag_files, open_bag
 from sphstereo_ros.replay.records import COMPRESSED, IMAGE, BadInput, Record, Source
 from sphstereo_ros.replay.videos import FRAME_SUFFIXES, FolderSource, VideoSource
 from sphstereo_ros.ros.images import ENCODINGS
 
 __all__ = ['MOTION_TOPICS', 'STEREO_TOPICS', 'BadInput', 'Record', 'Source', 'image_topic',
-           'motion_topics', 'open_source', 'replayed_topics']
+           'image_topics', 'motion_topics', 'open_source', 'replayed_topics']
 
 IMAGE_TOPICS = {'/image': IMAGE, '/image/compressed': COMPRESSED}
 STEREO_TOPICS = {f'/{side}{topic}': kind for side in ('top', 'bottom')
@@ -71,6 +72,45 @@ def image_topic(source: Source, wanted: str = '') -> str:
         raise BadInput(f'no topic /image or /image/compressed, and there {_listed(found)}; '
                        'choose with --topic' if found else 'no topic with 8-bit images')
     return found.pop()
+
+
+def image_topics(source: Source, binocular: bool, wanted: str = '') -> dict[str, Side | None]:
+    """Which topics have the images, and of which of two cameras each is.
+
+    Raises
+    ------
+    BadInput
+        as `image_topic`, or where one of two cameras is not there
+
+    """
+    if not binocular:
+        try:
+            return {image_topic(source, wanted): None}
+        except BadInput as error:
+            if _of_sides(source):
+                raise BadInput(f'{error} (for two cameras: pairing.mode: binocular, as in '
+                               'config/binocular.yaml)') from None
+            raise
+    if wanted:
+        raise BadInput('--topic: with two cameras the topics are top/image and bottom/image')
+    found = _of_sides(source)
+    for side in SIDES:
+        if side not in found.values():
+            raise BadInput(f'no topic /{side}/image or /{side}/image/compressed with messages '
+                           '(pairing.mode is binocular)')
+    return found
+
+
+def _of_sides(source: Source) -> dict[str, Side | None]:
+    """The topic of each of two cameras: `image`, or else its compressed twin."""
+    found: dict[str, Side | None] = {}
+    for side in SIDES:
+        for name, kind in IMAGE_TOPICS.items():
+            topic = f'/{side}{name}'
+            if source.topics.get(topic) == kind and source.count([topic]):
+                found[topic] = side
+                break
+    return found
 
 
 def _listed(topics: set[str]) -> str:

@@ -36,7 +36,8 @@ def frames_needed(config: Config, frame_bytes: int = 1) -> int:
 
     frame_bytes : of one frame's images, as the stage has them
     """
-    return farthest_reference(config.pairing, frame_bytes) + SPARE_FRAMES
+    needed = farthest_reference(config.pairing, frame_bytes) + SPARE_FRAMES
+    return 2 * needed if config.pairing.mode == 'binocular' else needed
 
 
 class WindowMatcher(Generic[Window]):

@@ -60,6 +60,7 @@ class Monitor:
         self._last_in = self._last_out = self._reported_at = clock()
         self._latencies: deque[float] = deque(maxlen=300)
         self._values: dict[str, object] = {}
+        self._warning = ''
 
     def arrived(self) -> float:
         """Count an input; returns its time of arrival."""
@@ -88,6 +89,12 @@ class Monitor:
         """Say what keeps this part from working, from now on; '' = nothing."""
         with self._lock:
             self._fault = text
+
+    def tell(self, values: dict[str, object], warning: str = '') -> None:
+        """Say what is worth telling from now on; a warning, until it is taken back."""
+        with self._lock:
+            self._values.update(values)
+            self._warning = warning
 
     def dropped(self, drop: Drop) -> None:
         """Count a drop."""
@@ -144,4 +151,6 @@ class Monitor:
         if silent > self.stall:
             return self._stall_level, ', '.join([f'stalled: no output for {silent:.1f} s',
                                                  *unexpected])
+        if self._warning:
+            return WARN, ', '.join([self._warning, *unexpected])
         return (WARN, 'dropped: ' + ', '.join(unexpected)) if unexpected else (OK, 'running')

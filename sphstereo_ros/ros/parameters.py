@@ -11,10 +11,12 @@ from sphstereo_ros.core.config import PARAMETERS, Config, Parameter, ParameterEr
 
 # Which of the package's parameters each node declares, by the beginnings of their names.
 NODE_PARAMETERS: dict[str, tuple[str, ...]] = {
-    'frame_pairing': ('camera.model', 'camera.mount.', 'camera.top.', 'baseline.', 'pairing.',
-                      'calibration.', 'stereo.working_height', 'points.colour'),
-    'pose_stabilisation': ('pose.', 'camera.mask', 'pairing.', 'baseline.source'),
-    'motion_alignment': ('alignment.', 'camera.mask', 'pairing.', 'baseline.source'),
+    'frame_pairing': ('camera.', 'baseline.', 'pairing.', 'calibration.', 'pose.', 'alignment.',
+                      'stereo.working_height', 'points.colour'),
+    'pose_stabilisation': ('pose.', 'camera.mask', 'pairing.', 'baseline.source',
+                           'calibration.each_pair'),
+    'motion_alignment': ('alignment.', 'camera.mask', 'pairing.', 'baseline.source',
+                         'calibration.each_pair'),
     'spherical_stereo': ('stereo.', 'range.', 'points.', 'camera.', 'baseline.relative_sigma',
                          'pairing.'),
     'obstacle_detection': ('obstacles.', 'camera.', 'range.'),
