@@ -65,7 +65,7 @@ def test_every_frame_is_used_once_or_counted(views: list[tuple[Side, int]],
 
 
 @given(st.integers(-20, 20), st.lists(st.integers(-5, 5), min_size=4, max_size=12),
-       st.randoms(use_true_random=False), st.sets(st.integers(0, 11), max_size=3))
+       st.randoms(use_true_random=False), st.sets(st.integers(0, 11), max_size=1))
 def test_pairs_are_those_of_the_nearest_stamps_in_whatever_order_cameras_deliver(
         offset: int, jitter: list[int], random: object, lost: set[int]) -> None:
     """Stamps some ms apart with jitter; a lost frame costs its own pair alone."""
@@ -77,9 +77,9 @@ def test_pairs_are_those_of_the_nearest_stamps_in_whatever_order_cameras_deliver
     out: list[object] = []
     queues = {side: list(times) for side, times in stamps.items()}
     while any(queues.values()):
-        # One camera's frames may come two later than the other's, not more.
+        # One camera may be one frame later than the other, not more.
         ready = [s for s in SIDES if queues[s] and not any(
-            queues[o] and queues[o][0] < queues[s][0] - 2 * STEP for o in SIDES)]
+            queues[o] and queues[o][0] < queues[s][0] - STEP - 50 * MS for o in SIDES)]
         side = random.choice(ready)  # type: ignore[attr-defined]
         out += fed(synchroniser, (side, queues[side].pop(0)))
     out += told(synchroniser.flush())
