@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,11 @@ from .aligned_view import CurrentView, current_view, followed
 from .camera import Equirectangular
 from .config import Config
 from .frames import Drop, Frame, Image8, RelativePose
-from .photometric import matched
+from .photometric import normalised
 from .relative_pose import (
     Correspondences,
     PoseEstimate,
+    best_rotation,
     epipolar_residuals,
     in_front,
     linearised,
@@ -44,6 +45,13 @@ Floats = NDArray[np.float64]
 
 _MARGIN, _WRAP = 8, 8
 _ROUNDS = 2  # refinements of a pair on its aligned copy: the second one knows ranges
+
+# Rotations about the prior that are tried first: up to 6° about each axis, in steps of a degree.
+_STEP = math.radians(1)
+_STEPS = _STEP * np.stack(np.meshgrid(*3 * [np.arange(-6, 7)]), axis=-1).reshape(-1, 3)
+
+# Contrast and its floor for the first, coarse search: even faint structure counts.
+_STRONG, _FAINT = 40.0, 12.0
 
 # Cells of equal area that tell how much of the sphere is seen: azimuths × latitudes; one is seen
 # where so many points lie in it. Errors are taken as alike within blocks of 2 × 2 cells.
@@ -186,12 +194,11 @@ class AlignmentCalibration:
         """What a pair of images (H, 2H) tells by itself; it is not kept. Drops as for `add`."""
         if top.shape != bottom.shape:
             return Drop('size_changed', f'{top.shape} and {bottom.shape}')
-        top = matched(top, bottom)
         coarse = self._coarse(top, bottom)
         if isinstance(coarse, Drop):
             return coarse
         height = self.config.alignment.working_height
-        images = [im if im.shape[0] < 1.3 * height else reduced(im, height)
+        images = [normalised(im if im.shape[0] < 1.3 * height else reduced(im, height))
                   for im in (top, bottom)]
         grid = PolarGrid(min(height, images[1].shape[0]), _MARGIN, _WRAP)
         pose = RelativePose(coarse.rotation, coarse.direction)
@@ -250,28 +257,37 @@ class AlignmentCalibration:
         """Rotation to a few tenths of a degree, from features followed or, failing that, matched.
         """
         config = self.config.pose
-        before, now = (reduced(im, config.working_height) for im in (top, bottom))
+        plain = [reduced(im, config.working_height) for im in (top, bottom)]
+        before, now = (normalised(im, _STRONG, _FAINT) for im in plain)
         mask = None if self._mask is None else _resized(self._mask, now.shape)
-        found = self.from_points(track(before, now, self._prior, config.max_points, mask))
+
+        def tracked(rotation: Floats) -> PoseEstimate | Drop:
+            points = track(before, now, rotation, config.max_points, mask)
+            return self.from_points(points, rotation)
+
+        found = tracked(self._prior)
         if isinstance(found, PoseEstimate):
             return found
-        wide = self.from_points(match(before, now, config.max_points, mask), matches=True)
+        points = match(plain[0], plain[1], config.max_points, mask)
+        wide = self.from_points(points, self._prior, config.min_inlier_ratio / 2)
         if isinstance(wide, Drop):
             return found if found.cause != 'too_few_points' else wide
-        return self.from_points(track(before, now, wide.rotation, config.max_points, mask))
+        return tracked(wide.rotation)
 
-    def from_points(self, points: Correspondences, *,
-                    matches: bool = False) -> PoseEstimate | Drop:
+    def from_points(self, points: Correspondences, prior: Floats | None = None,
+                    share: float | None = None) -> PoseEstimate | Drop:
         """The rotation that most correspondences (reference: top) fit, however large it is.
 
-        matches : they come from descriptors, so more of them are wrong
+        prior : (3, 3), where it is looked for first
+        share : of the points that must fit; None = `pose.min_inlier_ratio`
         """
         config = self.config.pose
         if len(points) < config.min_inliers:
             return Drop('too_few_points', f'{len(points)} points with texture')
-        best, most, fit_share = None, -1, config.min_inlier_ratio * (0.5 if matches else 1)
-        for rotation, direction in self._candidates(points):
-            fit = refine(rotation, direction, points, iterations=12,
+        best, most = None, -1
+        for rotation, direction in self._candidates(points, self._prior if prior is None
+                                                    else prior):
+            fit = refine(rotation, direction, points, iterations=30,
                          free_direction=self.estimate_direction)
             if fit is None:
                 continue
@@ -279,18 +295,25 @@ class AlignmentCalibration:
             count = int((residual < config.inlier_threshold).sum())
             if count > most:
                 best, most = fit, count
-        if best is None or most < max(config.min_inliers, fit_share * len(points)):
+        least = (config.min_inlier_ratio if share is None else share) * len(points)
+        if best is None or most < max(config.min_inliers, least):
             return Drop('too_few_inliers', f'{max(most, 0)} of {len(points)} fit one rotation')
         return self._sided(best, points)
 
-    def _candidates(self, points: Correspondences) -> list[tuple[Floats, Floats]]:
-        """Where to start from: what fits if all is far, and what a sample of five points tells."""
+    def _candidates(self, points: Correspondences,
+                    prior: Floats) -> list[tuple[Floats, Floats]]:
+        """Where to start from: what fits best near the prior and near the rotation that would
+        explain all if all was far, and what samples of five points tell.
+        """
         far = points
         for _ in range(5):
             turn = rotation_between(far)
             moved = parallax(turn, points)
             far = points[moved <= max(float(np.median(moved)), 1e-6)]
-        out = [(turn, self._direction)]
+        out = []
+        for centre in (prior, turn):
+            near = np.array([rotations.exp(step) @ centre for step in _STEPS])
+            out.append((best_rotation(near, self._direction, points, _STEP), self._direction))
         found = ransac(points, self.config.pose.inlier_threshold,
                        np.random.default_rng(self.config.pose.seed))
         if found is not None:
@@ -298,15 +321,25 @@ class AlignmentCalibration:
         return out
 
     def _sided(self, fit: PoseEstimate, points: Correspondences) -> PoseEstimate | Drop:
-        """The fit, unless what moved lies behind the cameras."""
+        """The fit, or that of its twin that has points in front of both cameras.
+
+        Half a turn about the baseline leaves all epipolar planes where they are.
+        """
+        twin = replace(fit, rotation=rotations.exp(np.pi * fit.direction) @ fit.rotation)
+        for pose in (fit, twin):
+            if self._behind(pose, points) <= _BEHIND:
+                return pose
+        return Drop('cameras_swapped', 'near points move the wrong way: are top and bottom '
+                    'swapped?')
+
+    def _behind(self, fit: PoseEstimate, points: Correspondences) -> float:
+        """Share of the points that moved which lie behind the cameras."""
         threshold = self.config.pose.inlier_threshold
         residual = np.abs(epipolar_residuals(fit.rotation, fit.direction, points))
         moved = points[(residual < threshold) & (parallax(fit.rotation, points) > threshold)]
-        ahead = in_front(fit.rotation, fit.direction, moved)
-        if len(moved) >= self.config.pose.min_inliers and (~ahead).mean() > _BEHIND:
-            return Drop('cameras_swapped', 'near points move the wrong way: are top and bottom '
-                        'swapped?')
-        return fit
+        if len(moved) < self.config.pose.min_inliers:
+            return 0.0
+        return float((~in_front(fit.rotation, fit.direction, moved)).mean())
 
     def _beside_mask(self, points: Correspondences) -> NDArray[np.bool_]:
         keep = np.ones(len(points), bool)

@@ -126,6 +126,18 @@ def _best_model(models: Floats, points: Correspondences,
     return models[best], float(cost[best]), float(share[best])
 
 
+def best_rotation(candidates: Floats, direction: Floats, points: Correspondences,
+                  threshold: float) -> Floats:
+    """The one of the rotations (M, 3, 3) that most points support (MSAC), the direction being
+    known.
+    """
+    models = rotations.skew(direction) @ candidates
+    cost, share = np.empty(len(models)), np.empty(len(models))
+    _judge(np.ascontiguousarray(models), np.ascontiguousarray(points.reference.T),
+           np.ascontiguousarray(points.current.T), threshold, cost, share)
+    return np.asarray(candidates[int(np.argmin(cost))])
+
+
 def ransac(points: Correspondences, threshold: float, rng: np.random.Generator, *,
            batch: int = 24, max_batches: int = 24, scored: int = 600,
            confidence: float = 0.999) -> tuple[Floats, Floats] | None:
