@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from sphstereo_ros.core import rotations
 from sphstereo_ros.core.config import PARAMETERS, Config
+from sphstereo_ros.mavlink.transports import parse_url
 from sphstereo_ros.replay.parameter_files import load_config, read_file
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -21,8 +23,8 @@ STAGES = ['frame_pairing', 'pose_stabilisation', 'motion_alignment', 'spherical_
 
 
 def test_there_are_configs() -> None:
-    assert [c.name for c in CONFIGS] == ['binocular.yaml', 'default.yaml', 'live.yaml',
-                                         'live_checked.yaml', 'paper.yaml']
+    assert [c.stem for c in CONFIGS] == ['ardupilot', 'binocular', 'default', 'live', 'live_checked',
+                                         'mavros', 'paper', 'px4']
 
 
 @pytest.mark.parametrize('file', CONFIGS, ids=lambda f: f.stem)
@@ -47,6 +49,21 @@ def test_the_default_leaves_the_references_open() -> None:
 def test_some_configs_name_their_references() -> None:
     for name, intervals in (('paper', (1,)), ('live', (1,)), ('live_checked', (2, 8))):
         assert load_config([ROOT / 'config' / f'{name}.yaml']).pairing.intervals == intervals
+
+
+@pytest.mark.parametrize('name', ['ardupilot', 'mavros', 'px4'])
+def test_configs_for_autopilots_change_obstacles_alone(name: str) -> None:
+    given = read_file(ROOT / 'config' / f'{name}.yaml')
+    assert all(parameter.startswith('obstacles.') for parameter in given)
+    url = load_config([ROOT / 'config' / f'{name}.yaml']).mavlink.url
+    assert (url == '') == (name == 'mavros')
+    if url:
+        assert parse_url(url).kind == 'serial'
+
+
+def test_mavros_is_told_the_frame() -> None:
+    content = yaml.safe_load((ROOT / 'config' / 'mavros.yaml').read_text())
+    assert content['/mavros/obstacle']['ros__parameters'] == {'mav_frame': 'BODY_FRD'}
 
 
 def test_default_config_states_the_defaults() -> None:

@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,15 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sphstereo_ros.core.frames import Drop
+from sphstereo_ros.mavlink.encoding import MissingLibraryError
 from sphstereo_ros.replay.parameter_files import load_config
 from sphstereo_ros.replay.records import BadInput
 from sphstereo_ros.replay.sources import image_topic, open_source
 from sphstereo_ros.ros.conversions import decode_frame
 
+from .autopilot import Autopilot
 from .processes import CHAINS, Process, Processes, numbers, private_domain, shipped
 from .speed import to_and_fro
 
-DEPTH, CLOUD = '/depth/image', '/points'
+DEPTH, CLOUD, MAVLINK = '/depth/image', '/points', 'OBSTACLE_DISTANCE'
 START_UP = 120.0  # seconds until the first depth
 SETTLE = 3.0
 RESTARTED = {'separate': ('pose_stabilisation', ('/pairs', '/frames')),
@@ -41,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--seconds', type=float, default=30.0, help='to be measured')
     parser.add_argument('--encoding', choices=('mono8', 'bgr8', 'jpeg'), default='mono8')
     parser.add_argument('--chain', choices=tuple(CHAINS), default='separate',
-                        help='four processes, or one')
+                        help='a process for each stage, or one for all')
+    parser.add_argument('--no-obstacles', action='store_true',
+                        help='no obstacle detection, and no MAVLink')
     parser.add_argument('--params', type=Path, action='append', default=[], metavar='FILE',
                         help='(default: config/live.yaml)')
     parser.add_argument('-p', action='append', default=[], dest='overrides',
@@ -113,14 +118,24 @@ class Usage:
 
 def _run(args: argparse.Namespace, parameters: list[str]) -> dict[str, Any]:
     from .observer import Observer
-    with tempfile.TemporaryDirectory() as name:
+    with tempfile.TemporaryDirectory() as name, ExitStack() as open_ones:
         folder = Path(name)
         np.save(folder / 'frames.npy', frames(args.bag, args.height, args.encoding != 'mono8'))
         private_domain()
+        arrivals: dict[str, list[tuple[int, int]]] = {}
+        if not args.no_obstacles:
+            autopilot = open_ones.enter_context(_autopilot())
+            arrivals[MAVLINK] = autopilot.arrivals
+            # The camera of this benchmark knows no attitude.
+            parameters = [*parameters, '-p', 'obstacles.require_attitude:=false',
+                          '-p', f'obstacles.mavlink.url:={autopilot.url}']
         with Processes(folder) as processes, Observer() as observer:
-            observer.watch(DEPTH, 'sensor_msgs/msg/Image')
-            observer.watch(CLOUD, 'sensor_msgs/msg/PointCloud2')
+            for topic, kind in ((DEPTH, 'sensor_msgs/msg/Image'),
+                                (CLOUD, 'sensor_msgs/msg/PointCloud2')):
+                arrivals[topic] = observer.watch(topic, kind).arrivals
             processes.start_chain(args.chain, parameters)
+            if not args.no_obstacles and args.chain == 'separate':
+                processes.start('obstacle_detection', '--ros-args', *parameters)
             processes.start('camera', sys.executable, '-m', 'sphstereo_ros.bench.camera',
                             str(folder / 'frames.npy'), '--rate', str(args.rate),
                             '--encoding', args.encoding, '--sent', str(folder / 'sent.json'))
@@ -133,9 +148,16 @@ def _run(args: argparse.Namespace, parameters: list[str]) -> dict[str, Any]:
             statuses = processes.stop(*processes.running)
     return {'chain': args.chain, 'height': args.height, 'encoding': args.encoding,
             'rate_wanted': args.rate, 'seconds': args.seconds,
-            **flow(sent, {t: observer.topics[t].arrivals for t in (DEPTH, CLOUD)}, window),
+            **flow(sent, arrivals, window),
             'stages': drops, 'processes': usage, 'first_depth_s': first, 'restart': restart,
             'exit_statuses': statuses}
+
+
+def _autopilot() -> Autopilot:
+    try:
+        return Autopilot()
+    except MissingLibraryError as error:
+        raise BadInput(f'{error}, or leave it out by --no-obstacles') from error
 
 
 class LiveBench:
@@ -214,7 +236,9 @@ def flow(sent: Sequence[int], arrivals: dict[str, list[tuple[int, int]]],
     seconds = (end - begin) / 1e9
     inside = [stamp for stamp in sent if begin <= stamp < end]
     out: dict[str, Any] = {'sent': len(inside), 'rate_in': round(len(inside) / seconds, 2)}
-    for topic, name in ((DEPTH, 'depth'), (CLOUD, 'cloud')):
+    for topic, name in ((DEPTH, 'depth'), (CLOUD, 'cloud'), (MAVLINK, 'mavlink')):
+        if topic not in arrivals:
+            continue
         there = [(stamp, at) for stamp, at in arrivals[topic] if begin <= at < end]
         latency = numbers([(at - stamp) / 1e6 for stamp, at in there])
         out |= {f'{name}_out': len(there), f'rate_{name}': round(len(there) / seconds, 2),
@@ -227,7 +251,9 @@ def table(result: dict[str, Any]) -> str:
     lines = [f'{result["chain"]}: {2 * result["height"]}×{result["height"]} {result["encoding"]}, '
              f'{result["rate_wanted"]:g} Hz wanted, {result["seconds"]:g} s',
              f'sent          {result["sent"]:6}  {result["rate_in"]:6.1f} Hz']
-    for name in ('depth', 'cloud'):
+    for name in ('depth', 'cloud', 'mavlink'):
+        if f'{name}_out' not in result:
+            continue
         latency = result[f'{name}_latency_ms']
         lines.append(f'{name:12}  {result[f"{name}_out"]:6}  {result[f"rate_{name}"]:6.1f} Hz   '
                      f'stamp → arrival p50 {latency["p50"]} ms, p95 {latency["p95"]} ms')
