@@ -17,13 +17,16 @@ from sphstereo_ros.cli.run import output_path
 from sphstereo_ros.core.chain import Chain
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import Frame, FrameKey
+from sphstereo_ros.core.level import Attitude
 from sphstereo_ros.core.motion import OdometrySample
+from sphstereo_ros.core.obstacles import ObstacleDetection
 from sphstereo_ros.replay import offline
 from sphstereo_ros.replay.bag_messages import make
 from sphstereo_ros.replay.output import McapOutput
 from sphstereo_ros.replay.records import FIRST_STAMP, BadInput
 from sphstereo_ros.replay.sources import open_source
 from sphstereo_ros.ros import conversions as convert
+from sphstereo_ros.ros.obstacle_messages import OUTPUTS
 
 STEP, HEIGHT, COUNT = 0.15, 240, 4
 FAST = ('-p', 'stereo.matcher:=bm')
@@ -83,7 +86,7 @@ def test_run_gives_what_the_core_gives(bag, frames, tmp_path, capsys):
     found = results(out)
     assert set(found) == {'/pairs', '/pairs/stabilised', '/pairs/aligned', '/depth/image',
                           '/depth/sigma', '/depth/preview', '/points', '/odometry/visual',
-                          '/diagnostics'}
+                          '/diagnostics', *(f'/{topic}' for topic in OUTPUTS)}
     expected = truth(frames, **{'baseline.source': 'odometry'})
     assert len(found['/depth/image']) == len(expected) == COUNT - 1
     for k, result in enumerate(expected):
@@ -110,6 +113,27 @@ def test_run_gives_what_the_core_gives(bag, frames, tmp_path, capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[:4] == ['frames in: 4', 'windows: 3', 'depth images: 3',
                          'dropped, first_frame: 1']
+
+
+def test_obstacles_are_written_where_attitude_and_metres_are_known(bag, frames, tmp_path, capsys):
+    out = tmp_path / 'out.mcap'
+    words = (*FAST, '--out', out, '--topics', 'obstacles/scan,obstacles/mavros')
+    assert run('run', bag, *words, '-p', 'baseline.source:=odometry',
+               '-p', 'obstacles.max:=3.0') == 0
+    found = results(out)
+    detection = ObstacleDetection(resolve({'obstacles.max': 3.0}))
+    # The level frame moves as base_link does.
+    level = Attitude(velocity=np.array([STEP / 0.033333333, 0, 0]))
+    for topic in ('obstacles/scan', 'obstacles/mavros'):
+        assert len(found[f'/{topic}']) == COUNT - 1
+        for message, result in zip(found[f'/{topic}'],
+                                   truth(frames, **{'baseline.source': 'odometry'}), strict=True):
+            expected = OUTPUTS[topic][1](make, detection.process(result.range_image, level))
+            np.testing.assert_array_equal(message.ranges, expected.ranges)
+            assert message.header == expected.header
+    assert np.isfinite(found['/obstacles/scan'][-1].ranges).sum() > 10
+    assert run('run', bag, *words) == 0  # without metres
+    assert 'written: 0 messages' in capsys.readouterr().out
 
 
 def test_what_moves_is_written_where_the_matcher_can_tell(bag, frames, tmp_path):

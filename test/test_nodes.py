@@ -164,8 +164,8 @@ def test_pipeline_on_compressed_images_without_a_baseline(ros: Graph) -> None:
             assert window.poses[-2].pose.position.z == pytest.approx(-1e-6)
     assert not client.received['/robot/depth/image']
     assert not client.received['/robot/points']
-    statuses = client.until(lambda: len(client.statuses()) == 4 and client.statuses(), 'statuses')
-    assert set(statuses) == {f'pipeline: {stage}' for stage in STAGES}
+    statuses = client.until(lambda: len(client.statuses()) == 5 and client.statuses(), 'statuses')
+    assert set(statuses) == {f'pipeline: {part}' for part in (*STAGES, 'obstacle_detection')}
 
 
 def rising(frame: Frame, i: int) -> Frame:

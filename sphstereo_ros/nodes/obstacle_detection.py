@@ -21,23 +21,12 @@ from sphstereo_ros.ros import obstacle_messages, qos
 from sphstereo_ros.ros.conversions import imu_sample, odometry_sample, read_stamped_depth
 from sphstereo_ros.ros.live_messages import make
 from sphstereo_ros.ros.matching import RangeMatcher
-from sphstereo_ros.ros.messages import MessageFactory
 from sphstereo_ros.ros.monitor import ERROR
 from sphstereo_ros.ros.shell import Output, Shell, run
 from sphstereo_ros.ros.transport import SMALL_PROFILE
 
 TakePart = Callable[[FrameKey, NDArray[np.float32], float], list[tuple[RangeImage | Drop, float]]]
-Build = Callable[[MessageFactory, ObstacleSectors], Any]
-
-OUTPUTS: dict[str, tuple[str, Build]] = {
-    'obstacles/scan': ('sensor_msgs/msg/LaserScan', obstacle_messages.scan_message),
-    'obstacles/mavros': ('sensor_msgs/msg/LaserScan', obstacle_messages.mavros_message),
-    'obstacles/points': ('sensor_msgs/msg/PointCloud2', obstacle_messages.points_message),
-    'obstacles/nearest': ('sensor_msgs/msg/Range', obstacle_messages.nearest_message),
-    'obstacles/time_to_contact': ('std_msgs/msg/Float32',
-                                  obstacle_messages.time_to_contact_message),
-    'obstacles/markers': ('visualization_msgs/msg/MarkerArray', obstacle_messages.markers_message),
-}
+# Comes with a workspace of PX4's.
 PX4 = ('/fmu/in/obstacle_distance', 'px4_msgs/msg/ObstacleDistance')
 
 
@@ -61,8 +50,9 @@ class ObstacleOutputs:
     """
 
     def __init__(self, shell: Shell) -> None:
-        self._outputs: list[tuple[Output, Build]] = [
-            (shell.output(kind, topic), build) for topic, (kind, build) in OUTPUTS.items()]
+        self._outputs: list[tuple[Output, obstacle_messages.Build]] = [
+            (shell.output(kind, topic), build)
+            for topic, (kind, build) in obstacle_messages.OUTPUTS.items()]
         if importlib.util.find_spec('px4_msgs') is not None:
             topic, kind = PX4
             self._outputs.append((shell.output(kind, topic), obstacle_messages.px4_message))

@@ -10,7 +10,9 @@ from typing import Any
 from sphstereo_ros.core.binocular import BinocularPairer
 from sphstereo_ros.core.chain import Chain, StageResults
 from sphstereo_ros.core.config import Config
-from sphstereo_ros.core.frames import Drop, Frame, PairedWindow
+from sphstereo_ros.core.frames import Drop, Frame, PairedWindow, RangeImage
+from sphstereo_ros.core.level import AttitudeHistory
+from sphstereo_ros.core.obstacles import ObstacleDetection
 from sphstereo_ros.core.preview import colour_map
 from sphstereo_ros.core.synchronisation import Side
 from sphstereo_ros.replay.bag_messages import make
@@ -33,10 +35,11 @@ from sphstereo_ros.ros.conversions import (
 )
 from sphstereo_ros.ros.images import read_mask
 from sphstereo_ros.ros.messages import SECOND
+from sphstereo_ros.ros.obstacle_messages import OUTPUTS
 
 TOPICS = ('/frames', '/pairs', '/pairs/stabilised', '/pairs/aligned', '/depth/image',
           '/depth/sigma', '/depth/relative', '/depth/moving', '/depth/preview', '/points',
-          '/odometry/visual', '/diagnostics')
+          '/odometry/visual', '/diagnostics', *(f'/{topic}' for topic in OUTPUTS))
 DEFAULT_TOPICS = frozenset(TOPICS) - {'/frames'}  # pixels are large
 
 SAMPLES: dict[str, Callable[[Any], Any]] = {
@@ -94,7 +97,11 @@ class OfflineRun:
         self._images = dict(images)
         self._output = output
         self._topics = topics
-        self._chain = Chain(config, read_mask(config.camera.mask))
+        mask = read_mask(config.camera.mask)
+        self._chain = Chain(config, mask)
+        self._obstacles = ObstacleDetection(config, mask)
+        self._attitudes = AttitudeHistory()
+        self._level_known = not config.obstacles.require_attitude
         pairer = self._chain.pairer
         self._add_sample: dict[str, Callable[[Any], Sequence[PairedWindow | Drop]]]
         self._add_sample = {'/odometry': pairer.add_odometry, '/twist': pairer.add_twist,
@@ -127,11 +134,20 @@ class OfflineRun:
         elif isinstance(message, Drop):
             self._drop(message)
         else:
-            sample = SAMPLES[record.topic](message)
-            if isinstance(sample, Drop):
-                self._drop(Drop(f'{record.topic[1:]}_{sample.cause}', sample.detail))
-            else:
-                self._pass_on(self._add_sample[record.topic](sample))
+            self._take_sample(record.topic, message)
+
+    def _take_sample(self, topic: str, message: Any) -> None:
+        sample = SAMPLES[topic](message)
+        if isinstance(sample, Drop):
+            self._drop(Drop(f'{topic[1:]}_{sample.cause}', sample.detail))
+            return
+        # What they throw away is counted by the pairing.
+        if topic == '/odometry':
+            self._attitudes.add_odometry(sample)
+        elif topic == '/imu':
+            self._attitudes.add_imu(sample)
+        self._level_known |= topic != '/twist'
+        self._pass_on(self._add_sample[topic](sample))
 
     def _take_image(self, side: Side | None, message: Any) -> None:
         frame = message if isinstance(message, Drop) else decode_frame(
@@ -195,6 +211,21 @@ class OfflineRun:
             outputs['/points'] = lambda: cloud_message(make, cloud)
         for topic, message in outputs.items():
             self._write(topic, key.stamp, message)
+        if measured.is_metric:
+            self._write_obstacles(measured)
+
+    def _write_obstacles(self, measured: RangeImage) -> None:
+        wanted = [topic for topic in OUTPUTS if f'/{topic}' in self._topics]
+        if self._output is None or not wanted or not self._level_known:
+            return
+        attitude = self._attitudes.at(measured.key.stamp)
+        found = attitude if isinstance(attitude, Drop) else self._obstacles.process(measured,
+                                                                                    attitude)
+        if isinstance(found, Drop):
+            self._drop(found)
+            return
+        for topic in wanted:
+            self._write(f'/{topic}', measured.key.stamp, partial(OUTPUTS[topic][1], make, found))
 
     def _diagnostics(self) -> Any:
         summary = self.summary

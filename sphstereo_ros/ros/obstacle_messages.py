@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -168,3 +169,14 @@ def level_transform_message(make: MessageFactory, stamp: int,
                 transform=make('geometry_msgs/msg/Transform', rotation=rotation))
 
 
+Build = Callable[[MessageFactory, ObstacleSectors], Any]
+
+# Topic → type, and what makes the message.
+OUTPUTS: dict[str, tuple[str, Build]] = {
+    'obstacles/scan': ('sensor_msgs/msg/LaserScan', scan_message),
+    'obstacles/mavros': ('sensor_msgs/msg/LaserScan', mavros_message),
+    'obstacles/points': ('sensor_msgs/msg/PointCloud2', points_message),
+    'obstacles/nearest': ('sensor_msgs/msg/Range', nearest_message),
+    'obstacles/time_to_contact': ('std_msgs/msg/Float32', time_to_contact_message),
+    'obstacles/markers': ('visualization_msgs/msg/MarkerArray', markers_message),
+}
