@@ -263,6 +263,7 @@ def test_bad_options_are_refused_before_anything_starts(
 
 def test_live_bench_measures_the_nodes() -> None:
     pytest.importorskip('rclpy')
+    pytest.importorskip('pymavlink')
     if not SAMPLE.exists():
         pytest.skip('no sample bag')
     done = subprocess.run(
@@ -274,6 +275,9 @@ def test_live_bench_measures_the_nodes() -> None:
     assert 11 <= result['sent'] <= 13
     assert 0 < result['depth_out'] <= 14
     assert 0 < result['depth_latency_ms']['p50'] < 5000
+    # As many as there are depth images, but for one under way at either end.
+    assert abs(result['mavlink_out'] - result['depth_out']) <= 2
+    assert 0 < result['mavlink_latency_ms']['p50'] < 5000
     assert result['stages']['pipeline: frame_pairing']['frames_in'] > 0
     assert result['processes']['pipeline']['memory_end_mb'] > 50
     assert result['restart']['node'] == 'pipeline'
