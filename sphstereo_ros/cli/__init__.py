@@ -21,6 +21,8 @@ COMMANDS = {
     'replay': ('sphstereo_ros.cli.replay', 'publish the inputs in a bag live, with /clock'),
     'import': ('sphstereo_ros.cli.import_video', 'any 360° video into a bag'),
     'mask': ('sphstereo_ros.cli.mask', "the vehicle's mask (camera.mask) from a recording"),
+    'calibrate': ('sphstereo_ros.cli.calibrate',
+                  'the alignment of two cameras, one above the other'),
     'scene': ('sphstereo_ros.scenes.command', 'render scenes with exact range and pose'),
     'bench': ('sphstereo_ros.bench.command', 'measure accuracy, speed, and the live nodes'),
 }
@@ -28,7 +30,7 @@ INTERRUPTED = 130
 
 
 def _parser() -> argparse.ArgumentParser:
-    commands = '\n'.join(f'  {name:8} {purpose}' for name, (_, purpose) in COMMANDS.items())
+    commands = '\n'.join(f'  {name:9} {purpose}' for name, (_, purpose) in COMMANDS.items())
     parser = argparse.ArgumentParser(
         prog='sphstereo', description='Depth in every direction from one 360° camera.',
         epilog=f'commands:\n{commands}\n\nsphstereo COMMAND --help tells more.',
