@@ -63,6 +63,7 @@ _STRENGTH = 0.02
 
 _DISAGREES = 0.05 * math.pi / 180  # rad by which a pair may differ from the others, or 5 sigma
 _MAX_DIRECTION_SIGMA = 0.2 * math.pi / 180
+_TELLING = ('wrong_direction', 'cameras_swapped')  # causes that say what to do
 _BEHIND = 0.5  # share of points behind the cameras from which on top and bottom are swapped
 
 
@@ -180,7 +181,8 @@ class AlignmentCalibration:
     def add(self, top: Frame, bottom: Frame) -> PairFit | Drop:
         """Take a pair of frames; returns what it tells by itself, or why it tells nothing.
 
-        Drops: `size_changed`, `too_few_points`, `too_few_inliers`, `cameras_swapped`.
+        Drops: `size_changed`, `too_few_points`, `too_few_inliers`, `wrong_direction`,
+        `cameras_swapped`.
         """
         fit = self.fit(top.image, bottom.image)
         if isinstance(fit, Drop):
@@ -271,7 +273,7 @@ class AlignmentCalibration:
         points = match(plain[0], plain[1], config.max_points, mask)
         wide = self.from_points(points, self._prior, config.min_inlier_ratio / 2)
         if isinstance(wide, Drop):
-            return found if found.cause != 'too_few_points' else wide
+            return wide if wide.cause in _TELLING or found.cause == 'too_few_points' else found
         return tracked(wide.rotation)
 
     def from_points(self, points: Correspondences, prior: Floats | None = None,
@@ -284,21 +286,38 @@ class AlignmentCalibration:
         config = self.config.pose
         if len(points) < config.min_inliers:
             return Drop('too_few_points', f'{len(points)} points with texture')
-        best, most = None, -1
-        for rotation, direction in self._candidates(points, self._prior if prior is None
-                                                    else prior):
-            fit = refine(rotation, direction, points, iterations=30,
-                         free_direction=self.estimate_direction)
+        least = max(config.min_inliers, (config.min_inlier_ratio if share is None else share)
+                    * len(points))
+        starts = self._candidates(points, self._prior if prior is None else prior)
+        best, most = self._best_fit(starts, points, self.estimate_direction)
+        if best is None or most < least:
+            free = None if self.estimate_direction else self._best_fit(starts, points, True)
+            if free is not None and free[0] is not None and free[1] >= least:
+                return self._leaning(free[0])
+            return Drop('too_few_inliers', f'{most} of {len(points)} fit one rotation')
+        return self._sided(best, points)
+
+    def _best_fit(self, starts: list[tuple[Floats, Floats]], points: Correspondences,
+                  free_direction: bool) -> tuple[PoseEstimate | None, int]:
+        """The fit with the most inliers, and how many these are."""
+        best, most = None, 0
+        for rotation, direction in starts:
+            fit = refine(rotation, direction if free_direction else self._direction, points,
+                         iterations=30, free_direction=free_direction)
             if fit is None:
                 continue
             residual = np.abs(epipolar_residuals(fit.rotation, fit.direction, points))
-            count = int((residual < config.inlier_threshold).sum())
+            count = int((residual < self.config.pose.inlier_threshold).sum())
             if count > most:
                 best, most = fit, count
-        least = (config.min_inlier_ratio if share is None else share) * len(points)
-        if best is None or most < max(config.min_inliers, least):
-            return Drop('too_few_inliers', f'{max(most, 0)} of {len(points)} fit one rotation')
-        return self._sided(best, points)
+        return best, most
+
+    def _leaning(self, free: PoseEstimate) -> Drop:
+        # The twin's direction may point the other way.
+        cosine = min(1.0, abs(float(free.direction @ self._direction)))
+        return Drop('wrong_direction', 'no rotation fits with baseline.direction as given; one '
+                    f'fits with a direction that leans by {math.degrees(math.acos(cosine)):.1f}° '
+                    'from it (or the frames of a pair are not of one time)')
 
     def _candidates(self, points: Correspondences,
                     prior: Floats) -> list[tuple[Floats, Floats]]:
@@ -317,7 +336,7 @@ class AlignmentCalibration:
         found = ransac(points, self.config.pose.inlier_threshold,
                        np.random.default_rng(self.config.pose.seed))
         if found is not None:
-            out.append((found[0], found[1] if self.estimate_direction else self._direction))
+            out.append(found)
         return out
 
     def _sided(self, fit: PoseEstimate, points: Correspondences) -> PoseEstimate | Drop:
