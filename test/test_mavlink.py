@@ -28,7 +28,7 @@ from sphstereo_ros.mavlink.encoding import Decoder, MissingLibraryError  # noqa:
 from sphstereo_ros.mavlink.link import MavlinkLink  # noqa: E402
 from sphstereo_ros.mavlink.timesync import TimeSync  # noqa: E402
 from sphstereo_ros.mavlink.transports import Address, parse_url  # noqa: E402
-from sphstereo_ros.ros.monitor import ERROR, OK, Monitor  # noqa: E402
+from sphstereo_ros.ros.monitor import ERROR, OK, WARN, Monitor  # noqa: E402
 
 PATIENCE = 10.0
 OFFSET = 1_699_999_000_000_000_000  # our clock less the autopilot's, nanoseconds
@@ -424,6 +424,18 @@ def test_listening_waits_for_somebody_to_send(connect: Connect, told: Told) -> N
         autopilot.say(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
         assert sent(autopilot, link, sectors({LEFT: 5.0})).distances[LEFT] == 500
         until(lambda: told.status().values.get('autopilot_heard_s', 'never') != 'never', 'it')
+
+
+def test_nobody_there_is_a_warning(connect: Connect, told: Told,
+                                   monkeypatch: pytest.MonkeyPatch) -> None:
+    """By UDP nothing else tells that nobody listens."""
+    monkeypatch.setattr(link_module, 'DEAF', 0.05)
+    with closing(UdpAutopilot()) as autopilot:
+        connect(autopilot.url)
+        until(lambda: 'no autopilot heard' in told.status().message, 'the warning')
+        assert told.status().level == WARN
+        monkeypatch.setattr(link_module, 'DEAF', 60.0)
+        until(lambda: told.status().level == OK, 'its end')
 
 
 def test_noise_does_no_harm(autopilot: Autopilot, connect: Connect, told: Told) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import replace
+from importlib.machinery import ModuleSpec
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -13,6 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sectors import FORWARD, LEFT, RIGHT, STAMP, sectors
 
+from sphstereo_ros.core.config import resolve
+from sphstereo_ros.core.level import Attitude
+from sphstereo_ros.core.rotations import matrix_from_quaternion, matrix_from_rpy
 from sphstereo_ros.core.sectors import SECTORS, ObstacleSectors, sector_centres
 from sphstereo_ros.mavlink.distances import autopilot_distances, sector_points
 from sphstereo_ros.replay.bag_messages import TYPESTORE
@@ -228,12 +232,65 @@ def test_markers_show_what_is_left_on_the_left(make: Any) -> None:
     assert marker.lifetime.sec + marker.lifetime.nanosec > 0
 
 
-def test_fake_px4_module_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+class FakeObstacleDistance:
+    """The fields of px4_msgs/ObstacleDistance."""
+
+    @staticmethod
+    def get_fields_and_field_types() -> dict[str, str]:
+        return {'timestamp': 'uint64', 'frame': 'uint8', 'sensor_type': 'uint8',
+                'distances': 'uint16[72]', 'increment': 'float', 'min_distance': 'uint16',
+                'max_distance': 'uint16', 'angle_offset': 'float'}
+
+
+class FakeShell:
+    """Takes what is published, by topic."""
+
+    def __init__(self) -> None:
+        self.config, self.node = resolve({}), None
+        self.sent: dict[str, Any] = {}
+
+    def output(self, kind: str, topic: str) -> Any:
+        return SimpleNamespace(wanted=True, send=lambda message: self.sent.update(
+            {topic: message()}))
+
+
+@pytest.mark.parametrize('there', [True, False])
+def test_px4_gets_it_where_its_messages_are(there: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip('rclpy')
-    from sphstereo_ros.ros.live_messages import message_class
-    package, messages = ModuleType('px4_msgs'), ModuleType('px4_msgs.msg')
-    messages.ObstacleDistance = type('ObstacleDistance', (), {})  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, 'px4_msgs', package)
-    monkeypatch.setitem(sys.modules, 'px4_msgs.msg', messages)
-    assert message_class('px4_msgs/msg/ObstacleDistance') is messages.ObstacleDistance
-    message_class.cache_clear()
+    from sphstereo_ros.nodes.obstacle_detection import ObstacleOutputs
+    if there:
+        for name in ('px4_msgs', 'px4_msgs.msg'):
+            module = ModuleType(name)
+            module.__spec__ = ModuleSpec(name, None)
+            monkeypatch.setitem(sys.modules, name, module)
+        monkeypatch.setattr(module, 'ObstacleDistance', FakeObstacleDistance, raising=False)
+    shell = FakeShell()
+    outputs = ObstacleOutputs(shell)  # type: ignore[arg-type]
+    outputs.deliver(sectors({LEFT: 5.0}), Attitude(), 0.0)
+    topic = '/fmu/in/obstacle_distance'
+    assert set(shell.sent) == {*obstacle_messages.OUTPUTS, *([topic] if there else [])}
+    if there:
+        assert isinstance(shell.sent[topic], FakeObstacleDistance)
+        assert shell.sent[topic].distances[LEFT] == 500
+
+
+def test_level_frame_is_told_where_tf2_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip('rclpy')
+    from sphstereo_ros.nodes.obstacle_detection import ObstacleOutputs
+    told: list[Any] = []
+    module = ModuleType('tf2_ros')
+    module.TransformBroadcaster = lambda node: SimpleNamespace(  # type: ignore[attr-defined]
+        sendTransform=told.append)
+    monkeypatch.setitem(sys.modules, 'tf2_ros', module)
+    outputs = ObstacleOutputs(FakeShell())  # type: ignore[arg-type]
+    roll = math.radians(20)
+    outputs.deliver(sectors(), Attitude(matrix_from_rpy(roll, 0, 0)), 0.0)
+    outputs.deliver(sectors(), None, 0.0)  # nothing is known of it
+    transform, = told
+    assert transform.header.frame_id == 'base_link'
+    assert transform.child_frame_id == 'base_link_level'
+    assert nanoseconds(transform.header.stamp) == STAMP
+    rotation = transform.transform.rotation
+    # The level frame's up, in base_link: the vehicle rolled to the right.
+    up = matrix_from_quaternion([rotation.x, rotation.y, rotation.z, rotation.w])[:, 2]
+    np.testing.assert_allclose(up, [0, math.sin(roll), math.cos(roll)], atol=1e-12)

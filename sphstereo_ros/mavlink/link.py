@@ -17,8 +17,11 @@ from sphstereo_ros.mavlink.encoding import Decoder, Encoder
 from sphstereo_ros.mavlink.timesync import AUTOPILOT, TimeSync
 from sphstereo_ros.mavlink.transports import Transport, open_transport, parse_url
 
+# Of diagnostic_msgs/DiagnosticStatus.
+WARN, ERROR = 1, 2
 PERIOD = 1.0  # seconds between heartbeats, and between questions for the time
 FIRST_WAIT, LONGEST_WAIT = 0.2, 5.0  # seconds between attempts to connect
+DEAF = 5.0  # seconds without a message of an autopilot
 # A stream that takes nothing for so long is dead, seconds.
 STUCK = 1.0
 # Bytes under way beside which a message may be sent: with more of them it would grow old.
@@ -40,8 +43,8 @@ class Told(Protocol):
     def dropped(self, drop: Drop) -> None:
         """They, or something else, failed."""
 
-    def fault(self, text: str) -> None:
-        """What keeps all of them from being sent; '' = nothing."""
+    def fault(self, text: str, level: int = ERROR) -> None:
+        """What keeps all of them from being sent, or from being heard; '' = nothing."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,7 @@ class MavlinkLink:
         self._out = bytearray()
         self._next_beat = 0.0
         self._waiting, self._moved_at = 0, self._told.clock()
+        self._opened_at = self._told.clock()
         self._heard_at: float | None = None
         self._answers: list[int] = []
 
@@ -142,13 +146,19 @@ class MavlinkLink:
         if self._transport is None and self._told.clock() >= self._next_attempt:
             self._connect()
         if self._transport is not None and self._transport.ready:
-            self._told.fault('')
+            self._tell_whether_heard()
             self._write(self._transport)
         else:
             if self._transport is not None:
                 self._told.fault(f'{self._config.url}: nobody has sent there yet')
             self._refuse_pending()
         self._rest()
+
+    def _tell_whether_heard(self) -> None:
+        last = self._opened_at if self._heard_at is None else self._heard_at
+        silent = self._told.clock() - last
+        self._told.fault('' if silent <= DEAF else f'{self._config.url}: no autopilot heard for '
+                         f'{silent:.0f} s', WARN)
 
     def _connect(self) -> None:
         self._reset()

@@ -50,7 +50,7 @@ class Monitor:
         self.clock = clock
         self.stall = stall
         self._stall_level = stall_level
-        self._fault = ''
+        self._fault, self._fault_level = '', OK
         self._on_new_cause = on_new_cause
         self._lock = threading.Lock()
         self._drops: Counter[str] = Counter()
@@ -85,10 +85,10 @@ class Monitor:
         with self._lock:
             self._last_in = self._last_out = self.clock()
 
-    def fault(self, text: str) -> None:
+    def fault(self, text: str, level: int = ERROR) -> None:
         """Say what keeps this part from working, from now on; '' = nothing."""
         with self._lock:
-            self._fault = text
+            self._fault, self._fault_level = text, level
 
     def tell(self, values: dict[str, object], warning: str = '') -> None:
         """Say what is worth telling from now on; a warning, until it is taken back."""
@@ -141,7 +141,7 @@ class Monitor:
         if recent['internal_error']:
             return ERROR, 'internal error'
         if self._fault:
-            return ERROR, self._fault
+            return self._fault_level, self._fault
         if self._in == 0:
             return OK, 'waiting for input'
         if now - self._last_in > self.stall:
