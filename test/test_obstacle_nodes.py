@@ -28,6 +28,7 @@ from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import Drop, FrameKey, RangeImage
 from sphstereo_ros.core.level import Attitude
 from sphstereo_ros.core.obstacles import ObstacleDetection
+from sphstereo_ros.core.rotations import matrix_from_rpy
 from sphstereo_ros.ros.matching import MAX_PENDING, RangeMatcher
 
 ROWS = 240
@@ -85,7 +86,10 @@ class Feed:
 
     def level(self, *stamps: int) -> None:
         for stamp in stamps:
-            self._imu.publish(imu(stamp))
+            self.roll(stamp, 0.0)
+
+    def roll(self, stamp: int, roll: float) -> None:
+        self._imu.publish(imu(stamp, roll))
 
     def depth(self, stamp: int, depth: np.ndarray, sigma: np.ndarray | None = None) -> None:
         self._depth.publish(floats(stamp, depth))
@@ -101,18 +105,20 @@ def test_what_is_on_the_left_is_told_on_the_left(ros: Graph) -> None:
             client.subscribe(kind, topic)
         feed = Feed(ros)
         depth, sigma = column_on_the_left()
-        feed.level(9 * STEP, 11 * STEP)
+        for stamp, roll in ((9 * STEP, 0.0), (11 * STEP, 0.2)):
+            feed.roll(stamp, roll)
         feed.depth(10 * STEP, depth, sigma)
         scan = client.stamped('obstacles/scan', 10 * STEP)
         expected = ObstacleDetection(resolve({})).process(
-            RangeImage(FrameKey(10 * STEP, 'camera_optical'), depth, sigma, True), Attitude())
+            RangeImage(FrameKey(10 * STEP, 'camera_optical'), depth, sigma, True),
+            Attitude(matrix_from_rpy(0.1, 0, 0)))  # between the two samples
         assert not isinstance(expected, Drop)
-        assert ray(scan, 90) == expected.distance[LEFT] == pytest.approx(5.0, rel=0.01)
+        assert ray(scan, 90) == expected.distance[LEFT] == pytest.approx(5.0, rel=0.02)
         assert math.isnan(ray(scan, -90))  # unknown, not free
         assert math.isnan(ray(scan, 0))
         assert scan.header.frame_id == 'base_link_level'
         dialect = client.stamped('obstacles/mavros', 10 * STEP)
-        assert dialect.ranges[LEFT] == pytest.approx(5.0, rel=0.01)
+        assert dialect.ranges[LEFT] == expected.distance[LEFT]
         assert np.isfinite(dialect.ranges).sum() == np.isfinite(scan.ranges).sum()
         nearest = client.stamped('obstacles/nearest', 10 * STEP)
         assert nearest.range == pytest.approx(5.0, rel=0.02)
@@ -123,7 +129,7 @@ def test_what_is_on_the_left_is_told_on_the_left(ros: Graph) -> None:
         assert math.isnan(client.message('obstacles/time_to_contact', 0).data)
         assert client.message('obstacles/markers', 0).markers
         message, = autopilot.wait('OBSTACLE_DISTANCE')
-        assert message.distances[LEFT] == pytest.approx(500, abs=6)
+        assert message.distances[LEFT] == pytest.approx(100 * expected.distance[LEFT], abs=1)
         assert message.distances[22] == 65535
         assert message.time_usec == 10 * STEP // 1000
         check_silence_on_stall(ros, autopilot)
@@ -156,7 +162,6 @@ def test_bad_input_is_a_named_drop(ros: Graph) -> None:
     short = floats(12 * STEP, depth)
     del short.data[-1:]
     feed._depth.publish(short)
-    client.dropped(NODE, 'wrong_data_length')
     feed.depth(13 * STEP, depth, sigma)
     client.stamped('obstacles/scan', 13 * STEP)
     feed.depth(12 * STEP, depth, sigma)
@@ -168,6 +173,7 @@ def test_bad_input_is_a_named_drop(ros: Graph) -> None:
     blind = client.stamped('obstacles/scan', 15 * STEP)
     assert np.isnan(blind.ranges).all()  # nothing is known: nothing is free
     client.dropped(NODE, 'sigma_missing')
+    client.dropped(NODE, 'wrong_data_length')
     assert [m.header.stamp.nanosec for m in client.received['obstacles/scan']] == [
         300_000_000, 500_000_000]
     assert drops(client.statuses()[NODE]).get('internal_error', 0) == 0
