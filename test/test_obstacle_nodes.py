@@ -5,6 +5,7 @@ import math
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,9 @@ from sphstereo_ros.core.frames import Drop, FrameKey, RangeImage
 from sphstereo_ros.core.level import Attitude
 from sphstereo_ros.core.obstacles import ObstacleDetection
 from sphstereo_ros.core.rotations import matrix_from_rpy
+from sphstereo_ros.nodes.obstacle_detection import ObstacleDetectionComponent
 from sphstereo_ros.ros.matching import MAX_PENDING, RangeMatcher
+from sphstereo_ros.ros.monitor import Monitor
 
 ROWS = 240
 NODE = 'obstacle_detection'
@@ -230,6 +233,39 @@ def test_wrong_words_end_the_start_with_one_line(ros: Graph, word: str, told: st
 
 
 # Matching, without a graph
+
+class Counted:
+    """A shell whose node is asked for everything and says what it worked on."""
+
+    def __init__(self, rate: float) -> None:
+        self.config, self.mask, self.node = resolve({'obstacles.max_rate': rate}), None, None
+        self.stamps: list[int] = []
+
+    def monitor(self, part: str, stall: float, level: int) -> Monitor:
+        self.told = Monitor(part)
+        return self.told
+
+    def worker(self, name: str, monitor: Monitor) -> Any:
+        return SimpleNamespace(put_newest=lambda job: self.stamps.append(job.args[0].key.stamp))
+
+    def output(self, kind: str, topic: str) -> Any:
+        return SimpleNamespace(wanted=True)
+
+
+@pytest.mark.parametrize(('hertz', 'rate', 'taken'), [(30, 20.0, 15), (20, 20.0, 20),
+                                                      (30, 0.0, 30), (23, 20.0, 12)])
+def test_rate_limit_by_stamps(hertz: int, rate: float, taken: int) -> None:
+    shell = Counted(rate)
+    component = ObstacleDetectionComponent(shell)  # type: ignore[arg-type]
+    depth = np.zeros((2, 4), np.float32)
+    for i in range(hertz):
+        component.offer(RangeImage(FrameKey(10**9 + i * 10**9 // hertz, 'camera'), depth, depth,
+                                   True), 0.0)
+    assert len(shell.stamps) == taken
+    assert shell.told.count('rate_limit') == hertz - taken
+    component.offer(RangeImage(FrameKey(5, 'camera'), depth, depth, True), 0.0)
+    assert shell.stamps[-1] == 5  # time that runs back is for the detection to drop
+
 
 def decided(given: list[tuple[Any, float]]) -> list[Any]:
     return [r.cause if isinstance(r, Drop) else r.key.stamp for r, _ in given]

@@ -267,6 +267,8 @@ class ObstaclesConfig:
                               'the time to contact', unit='m', low=0.0, high=100.0)
     require_attitude: bool = _p('obstacles.require_attitude', True, 'without roll and pitch there '
                                 'is no result; false: base_link is taken for level')
+    max_rate: float = _p('obstacles.max_rate', 0.0, 'depth images a second at most in which '
+                         'obstacles are looked for; 0 = all', unit='Hz', low=0.0, high=1000.0)
     stall: float = _p('obstacles.stall', 0.5, 'no new depth for so long is an error in '
                       '/diagnostics; what is older is not sent', unit='s', low=0.05, high=10.0)
 

@@ -21,11 +21,14 @@ from sphstereo_ros.ros import obstacle_messages, qos
 from sphstereo_ros.ros.conversions import imu_sample, odometry_sample, read_stamped_depth
 from sphstereo_ros.ros.live_messages import make
 from sphstereo_ros.ros.matching import RangeMatcher
+from sphstereo_ros.ros.messages import SECOND
 from sphstereo_ros.ros.monitor import ERROR
 from sphstereo_ros.ros.shell import Output, Shell, run
 from sphstereo_ros.ros.transport import SMALL_PROFILE
 
 TakePart = Callable[[FrameKey, NDArray[np.float32], float], list[tuple[RangeImage | Drop, float]]]
+# Of the least time between depth images that are used: stamps jitter.
+EARLY = 0.9
 # Comes with a workspace of PX4's.
 PX4 = ('/fmu/in/obstacle_distance', 'px4_msgs/msg/ObstacleDistance')
 
@@ -105,6 +108,7 @@ class ObstacleDetectionComponent:
         self._matcher = RangeMatcher()
         self._worker = shell.worker('obstacle_detection', self._monitor)
         self._last: FrameKey | None = None
+        self._taken: int | None = None
 
     def warm_up(self) -> None:
         """Compile what detection needs."""
@@ -142,7 +146,15 @@ class ObstacleDetectionComponent:
             self._monitor.idle()
             return
         self._monitor.arrived()
+        if self._is_early(image.key.stamp):
+            self._monitor.dropped(Drop('rate_limit', 'the next one serves'))
+            return
+        self._taken = image.key.stamp
         self._worker.put_newest(partial(self._process, image, arrival))
+
+    def _is_early(self, stamp: int) -> bool:
+        rate, last = self._shell.config.obstacles.max_rate, self._taken
+        return rate > 0 and last is not None and 0 < stamp - last < EARLY * SECOND / rate
 
     def _take_part(self, add: TakePart, message: Any) -> None:
         part = read_stamped_depth(message)

@@ -14,7 +14,7 @@ from sphstereo_ros.ros.conversions import Status
 
 OK, WARN, ERROR = 0, 1, 2
 # Counted like all drops, but as they should be: no reason to warn.
-EXPECTED = frozenset({'first_frame', 'other_transport'})
+EXPECTED = frozenset({'first_frame', 'other_transport', 'rate_limit'})
 STALL = 2.0
 
 
