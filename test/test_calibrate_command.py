@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import analytic_world
 import cv2
@@ -84,6 +85,14 @@ def test_it_writes_what_the_nodes_load(bag, tmp_path, capsys):
     assert said.err == ''
 
 
+def test_the_sample(tmp_path):
+    """Its top camera is also darker, and of another white balance (bags/README.md)."""
+    sample = Path(__file__).resolve().parent.parent / 'bags' / 'binocular.mcap'
+    assert sample.stat().st_size < 5e6
+    assert calibrate(sample, '--out', tmp_path / 'rig.yaml', '--max-pairs', 3) == 0
+    np.testing.assert_allclose(angles(tmp_path / 'rig.yaml'), (2.0, -1.5, 3.0), atol=0.02)
+
+
 def test_the_pictures_show_before_and_after(bag, tmp_path):
     out = tmp_path / 'rig.yaml'
     assert calibrate(bag, '--out', out, '--max-pairs', 1) == 0
@@ -131,8 +140,8 @@ REFUSED = {
     'none wanted': (['--max-pairs', '0'], '--max-pairs: must be at least 1'),
     'no direction': (['--direction', 'up'], "--direction up: needs X,Y,Z, not all zero, or"),
     'null': (['--direction', '0,0,0'], 'not all zero'),
-    'wrong': (['--direction', '0.2,0,1'], 'wrong_direction: no rotation fits with '
-              'baseline.direction as given; one fits with a direction that leans by 11.'),
+    'wrong': (['--direction', '0.2,0,1'], 'wrong_direction: what fits is not '
+              'baseline.direction as given, but one that leans by 11.'),
     'uncertain': (['-p', 'calibration.max_sigma:=0.00001'], 'calibration_uncertain: standard '),
 }
 

@@ -152,6 +152,9 @@ def test_a_wrong_direction_shows_as_lean():
     result = told(points, **{'calibration.max_sigma': 1.0})
     assert math.degrees(result.lean) == pytest.approx(3, abs=0.1)
     assert result.lean > 5 * result.lean_sigma
+    refused = told(points)
+    assert refused.cause == 'wrong_direction'
+    assert 'leans by 3.0° from it, and turns the cameras by ' in refused.detail
     upright = told(seen(rng, (0, 0, 0), noise=3e-4, near=1.0, far=6.0))
     assert upright.lean < 5 * upright.lean_sigma
 

@@ -1,6 +1,7 @@
 """Two cameras in rendered scenes: the same world, the rig as it is said to be."""
 from __future__ import annotations
 
+import argparse
 import json
 
 import numpy as np
@@ -12,6 +13,7 @@ from sphstereo_ros.core.camera import Equirectangular
 from sphstereo_ros.core.rotations import OPTICAL_FROM_LINK, matrix_from_rpy, top_rpy
 from sphstereo_ros.replay.sources import open_source
 from sphstereo_ros.ros.conversions import decode_frame, odometry_sample, read_depth
+from sphstereo_ros.scenes import command
 from sphstereo_ros.scenes.bag import write_binocular_bag
 from sphstereo_ros.scenes.binocular import TopCamera, render_binocular, save_binocular
 from sphstereo_ros.scenes.imaging import NO_NOISE
@@ -123,3 +125,25 @@ def test_folder_and_bag_hold_it(rendered, tmp_path):
 def test_roll_pitch_yaw_as_elsewhere():
     np.testing.assert_allclose(top_rpy(OPTICAL_FROM_LINK @ matrix_from_rpy(*RPY)
                                        @ OPTICAL_FROM_LINK.T), RPY)
+
+
+def _command(*words):
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    return command.main(parser.parse_args([str(word) for word in words]))
+
+
+def test_command_renders_pairs(tmp_path, capsys):
+    folder, bag = tmp_path / 'out', tmp_path / 'pairs.mcap'
+    assert _command('corridor', folder, '--binocular', '--frames', 2, '--height', HEIGHT,
+                    '--top', 1, -2, 3, '--baseline', 0.2, '--direction', 0, 0.1, 1, '--spacing', 0,
+                    '--top-gain', 0.7, '--bag', bag) == 0
+    capsys.readouterr()
+    meta = json.loads((folder / 'meta.json').read_text())
+    np.testing.assert_allclose(meta['pairs'][1]['top_in_bottom_rpy_deg'], (1, -2, 3))
+    np.testing.assert_allclose(meta['pairs'][1]['top_in_bottom_xyz'],
+                               0.2 * np.array([0, 0.1, 1]) / np.hypot(0.1, 1))
+    assert meta['frames'][0]['position_m'] == meta['frames'][2]['position_m']
+    assert open_source(bag).count(['/top/image/compressed']) == 2
+    assert _command('corridor', tmp_path / 'no', '--binocular', '--baseline', 0) == 2
+    assert 'must be positive' in capsys.readouterr().err

@@ -63,6 +63,9 @@ _STRENGTH = 0.02
 
 _DISAGREES = 0.05 * math.pi / 180  # rad by which a pair may differ from the others, or 5 sigma
 _MAX_DIRECTION_SIGMA = 0.2 * math.pi / 180
+# A direction that the pictures tell, so many sigma from the one given, is wrong where it changes
+# the rotation by so many times what may be uncertain.
+_SIGNIFICANT, _SHIFTED = 4, 2
 _TELLING = ('wrong_direction', 'cameras_swapped')  # causes that say what to do
 _BEHIND = 0.5  # share of points behind the cameras from which on top and bottom are swapped
 
@@ -211,8 +214,8 @@ class AlignmentCalibration:
         """What all pairs tell together, or why that is not enough.
 
         Drops: `no_pairs`; the most frequent failure of `add`, where no pair was of use;
-        `pairs_disagree`; `too_little_of_sphere`; `calibration_uncertain`; `no_parallax` (only
-        where the direction was to be estimated).
+        `pairs_disagree`; `too_little_of_sphere`; `calibration_uncertain`; `wrong_direction` (the
+        one given); `no_parallax` (only where the direction was to be estimated).
         """
         if not self.fits:
             return _most_frequent(self.drops)
@@ -312,12 +315,12 @@ class AlignmentCalibration:
                 best, most = fit, count
         return best, most
 
-    def _leaning(self, free: PoseEstimate) -> Drop:
+    def _leaning(self, free: PoseEstimate, more: str = '') -> Drop:
         # The twin's direction may point the other way.
         cosine = min(1.0, abs(float(free.direction @ self._direction)))
-        return Drop('wrong_direction', 'no rotation fits with baseline.direction as given; one '
-                    f'fits with a direction that leans by {math.degrees(math.acos(cosine)):.1f}° '
-                    'from it (or the frames of a pair are not of one time)')
+        return Drop('wrong_direction', 'what fits is not baseline.direction as given, but one '
+                    f'that leans by {math.degrees(math.acos(cosine)):.1f}° from it{more}; give or '
+                    'estimate it (or the frames of a pair are not of one time)')
 
     def _candidates(self, points: Correspondences,
                     prior: Floats) -> list[tuple[Floats, Floats]]:
@@ -386,6 +389,10 @@ class AlignmentCalibration:
             return Drop('too_little_of_sphere', f'points in {100 * result.share:.0f} % of the '
                         'sphere do not fix roll, pitch and yaw')
         limit = self.config.calibration.max_sigma
+        if not self.estimate_direction and free is not None and lean > _SIGNIFICANT * lean_sigma:
+            turn = rotations.angle(pose.rotation @ free.rotation.T)
+            if turn > _SHIFTED * limit:
+                return self._leaning(free, f', and turns the cameras by {_degrees(turn)}')
         if result.sigma > limit:
             return Drop('calibration_uncertain', f'standard deviation {_degrees(result.sigma)} is '
                         f'over {_degrees(limit)}: too little texture, or things that move')

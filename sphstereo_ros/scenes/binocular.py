@@ -88,7 +88,8 @@ class BinocularSequence(Sequence[TruthFrame]):
 
 
 def render_binocular(name: str, seed: int, pairs: int, height: int = 960,
-                     rig: TopCamera | None = None, *, spacing: float | None = None,
+                     rig: TopCamera | None = None, *,
+                     spacing: float | Sequence[float] | None = None,
                      **options: Any) -> BinocularSequence:
     """A sequence of pairs of the scene `name`, to be rendered on demand.
 
@@ -97,7 +98,8 @@ def render_binocular(name: str, seed: int, pairs: int, height: int = 960,
     name, seed, height : as for `render_sequence`
     pairs : so many
     rig : where the top camera is; the bottom one follows the trajectory
-    spacing : metres between consecutive pairs; 0 hovers, None is the scene's own
+    spacing : metres between consecutive pairs, one or pairs − 1 values; 0 hovers, None is the
+        scene's own
     options : others of `render_sequence`, for both cameras
 
     """
