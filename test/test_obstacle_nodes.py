@@ -20,7 +20,7 @@ from ros_graph import Graph, drops, graph, mono8, odometry, set_stamp
 from sectors import LEFT
 from sensor_msgs.msg import Image, Imu, LaserScan, PointCloud2, Range
 from std_msgs.msg import Float32
-from test_mavlink import UdpAutopilot
+from test_mavlink import TcpAutopilot, UdpAutopilot
 from test_obstacle_messages import ray
 from visualization_msgs.msg import MarkerArray
 
@@ -150,7 +150,8 @@ def check_silence_on_stall(ros: Graph, autopilot: UdpAutopilot) -> None:
 
 def test_bad_input_is_a_named_drop(ros: Graph) -> None:
     client = ros.client
-    process = ros.start(NODE)
+    autopilot = TcpAutopilot()
+    process = ros.start(NODE, f'obstacles.mavlink.url:={autopilot.url}')
     client.subscribe(LaserScan, 'obstacles/scan')
     client.linked('obstacles/scan')
     feed = Feed(ros)
@@ -167,14 +168,22 @@ def test_bad_input_is_a_named_drop(ros: Graph) -> None:
     feed._depth.publish(short)
     feed.depth(13 * STEP, depth, sigma)
     client.stamped('obstacles/scan', 13 * STEP)
+    assert len(autopilot.wait('OBSTACLE_DISTANCE')) == 1
+    autopilot.close()  # the socket, too
     feed.depth(12 * STEP, depth, sigma)
     client.dropped(NODE, 'stamp_backward')
     feed.depth(12 * STEP, depth, sigma)
     client.dropped(NODE, 'duplicate_stamp')
+    client.dropped(f'{NODE}: mavlink', 'mavlink_lost')
+    autopilot = TcpAutopilot(autopilot.port)
+    autopilot.wait('HEARTBEAT')
     feed.depth(14 * STEP, depth)  # without sigma
     feed.depth(15 * STEP, np.full_like(depth, np.nan), np.full_like(depth, np.nan))
     blind = client.stamped('obstacles/scan', 15 * STEP)
     assert np.isnan(blind.ranges).all()  # nothing is known: nothing is free
+    message, = autopilot.wait('OBSTACLE_DISTANCE')
+    assert set(message.distances) == {65535}
+    autopilot.close()
     client.dropped(NODE, 'sigma_missing')
     client.dropped(NODE, 'wrong_data_length')
     assert [m.header.stamp.nanosec for m in client.received['obstacles/scan']] == [
