@@ -129,7 +129,9 @@ def test_earlier_frames_join_where_the_rig_moves(source: str) -> None:
         np.testing.assert_allclose(reference.pose.position, (0, 0, -step * back), atol=0.02)
     median, known = error(last.range_image.range, view('bottom', step * 3).range)
     assert median < 0.016
-    assert known > 0.7
+    assert known > 0.88
+    # Straight down the pair alone knows little.
+    assert np.isfinite(last.range_image.range[-8:]).mean() > 0.9
 
 
 def test_motion_can_be_left_out() -> None:

@@ -23,8 +23,8 @@ STAGES = ['frame_pairing', 'pose_stabilisation', 'motion_alignment', 'spherical_
 
 
 def test_there_are_configs() -> None:
-    assert [c.stem for c in CONFIGS] == ['ardupilot', 'binocular', 'default', 'live',
-                                         'live_checked', 'mavros', 'paper', 'px4']
+    assert [c.stem for c in CONFIGS] == ['ardupilot', 'binocular', 'binocular_live', 'default',
+                                         'live', 'live_checked', 'mavros', 'paper', 'px4']
 
 
 @pytest.mark.parametrize('file', CONFIGS, ids=lambda f: f.stem)

@@ -11,12 +11,13 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from . import rotations
 from .baseline import SECOND
-from .calibration import AlignmentCalibration, configured_pose
+from .calibration import AlignmentCalibration, configured_pose, estimate_alignment
 from .config import Config
 from .drift import DriftTracker
 from .frames import UNSCALED, Drop, Frame, FrameKey, Image8, PairedWindow, Reference, RelativePose
@@ -186,6 +187,15 @@ class BinocularPairer(Pairer):
             return ''
         return f'{silent[0]} camera silent' + (
             ', the other continues as monocular' if self._full.pairing.fallback else '')
+
+    def warm_up(self) -> None:
+        """Compile what the alignment of the cameras needs."""
+        calibration = self._full.calibration
+        if calibration.pairs or calibration.online:
+            noise = np.random.default_rng(0).integers(0, 255, (60, 120), np.uint8)
+            image = cv2.resize(noise, (480, 240), interpolation=cv2.INTER_CUBIC)
+            still = Frame(FrameKey(0, ''), np.asarray(image, np.uint8))
+            estimate_alignment([(still, still)], self._full)
 
     def named(self, side: Side, frame: Frame) -> Frame:
         """The frame under a name of its own: both cameras may come with one frame_id."""

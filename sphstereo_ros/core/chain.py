@@ -55,7 +55,7 @@ class Chain:
 
     def warm_up(self) -> None:
         """Compile what all stages need."""
-        for stage in (self.stabiliser, self.aligner, self.stereo):
+        for stage in (self.pairer, self.stabiliser, self.aligner, self.stereo):
             stage.warm_up()
 
     def add_frame(self, frame: Frame) -> list[StageResults | Drop]:

@@ -116,12 +116,13 @@ def filled(rho: Map) -> Map:
 @kernel
 def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map, sin_lon: Map,
                   axes: Map, at_pole: Map, rho: Map, information: Map, misfit: Map, other: Map,
-                  baselines: Map, pose: Map, tolerance: Map, out: Map, sigma_out: Map,
+                  baselines: Map, ways: Map, pose: Map, tolerance: Map, out: Map, sigma_out: Map,
                   other_out: Map, agreed: Image8) -> None:  # pragma: no cover - compiled
     """Sample the polar grid; σ and agreement of every pixel.
 
-    at_pole : column of the pole, row of the azimuth 0, rad of a pixel; pose : (references, 3)
-    standard deviations of rotation, direction, baseline; tolerance : see `_tolerance`
+    at_pole : column of the pole, row of the azimuth 0, rad of a pixel; ways : (references, 3)
+    directions of motion; pose : (references, 3) standard deviations of rotation, direction,
+    baseline; tolerance : see `_tolerance`
     """
     at = np.empty((4, cos_lon.size), np.float32)
     half, nothing = np.float32(0.5), np.float32(NOTHING)
@@ -137,13 +138,18 @@ def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Ma
             spread = max(max(a, b), max(d, e)) - min(min(a, b), min(d, e))
             if spread < np.float32(0.05) * abs(value):
                 value = (a * (1 - fc) + b * fc) * (1 - fr) + (d * (1 - fc) + e * fc) * fr
-            k = 0
+            # The reference that sees it from the side, as far away as looks alike.
+            k, sine, cosine = 0, max(at[0, j], np.float32(0.01)), at[1, j]
             for n in range(1, baselines.size):
-                k = n if abs(value) * baselines[n] < np.float32(REACH) else k
-            sine = max(at[0, j], np.float32(0.01))
+                c = (cos_lat[i] * (sin_lon[j] * ways[n, 0] + cos_lon[j] * ways[n, 2])
+                     - sin_lat[i] * ways[n, 1])
+                s = np.sqrt(max(np.float32(1) - c * c, np.float32(1e-4)))
+                if abs(value) * baselines[n] < np.float32(REACH) and (
+                        baselines[n] * s > baselines[k] * sine):
+                    k, sine, cosine = n, s, c
             match = np.float32(_FLOOR) * at_pole[2]
             by_angle = np.sqrt(match * match + pose[k, 0] * pose[k, 0]) / (baselines[k] * sine)
-            by_pose = value * (at[1, j] / sine * pose[k, 1] + pose[k, 2])
+            by_pose = value * (cosine / sine * pose[k, 1] + pose[k, 2])
             told = np.float32(_DEPENDENT * _DEPENDENT) / max(information[rn, cn],
                                                             np.float32(1e-9))
             out[i, j] = value
@@ -188,7 +194,7 @@ class JointMatcher:
         refined = self._refined(view, grid, axes, pairs, filled(matched))
         moving = off_meridian(parallax, refined.misfit, grid, axes, pairs[0][1], height)
         if self._sweeps:
-            swept = [p for p in pairs if p[1].baseline <= _SWEPT * pairs[0][1].baseline]
+            swept = self._swept(pairs)
             coarse, _ = sweep(view, grid, axes, swept)
             other = cv2.resize(coarse, grid.shape[::-1], interpolation=cv2.INTER_LINEAR)
             tolerance = _tolerance([p.baseline for _, p in swept],
@@ -197,6 +203,10 @@ class JointMatcher:
             other, tolerance = matched, _tolerance_of_match(pairs[0][1].baseline, grid.pixel)
         measured = self._on_sphere(refined, other, tolerance, grid, axes, pairs, height)
         return replace(measured, moving=moving)
+
+    def _swept(self, pairs: Sequence[tuple[Image8, RelativePose]],
+               ) -> list[tuple[Image8, RelativePose]]:
+        return [p for p in pairs if p[1].baseline <= _SWEPT * pairs[0][1].baseline]
 
     def _parallax(self, view: Image8, nearest: tuple[Image8, RelativePose], grid: PolarGrid,
                   axes: Floats) -> Parallax:
@@ -223,10 +233,11 @@ class JointMatcher:
         poses = np.array([pose_sigmas(p) for _, p in pairs], np.float32)
         poses[poses[:, 2] == 0, 2] = self._baseline_sigma
         baselines = np.array([p.baseline for _, p in pairs], np.float32)
+        ways = np.array([p.direction for _, p in pairs], np.float32)
         rows_in_parallel(_measure_rows, height, *_grid_angles(height),
                          np.ascontiguousarray(axes, np.float32), at_pole, refined.rho,
-                         refined.information, refined.misfit, other, baselines, poses, tolerance,
-                         rho, sigma, second, agreed)
+                         refined.information, refined.misfit, other, baselines, ways, poses,
+                         tolerance, rho, sigma, second, agreed)
         return Measurement(rho, sigma, second, agreed)
 
 

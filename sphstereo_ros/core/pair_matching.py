@@ -1,56 +1,92 @@
-"""Matching of one pair of cameras that look at the same moment.
+"""Matching of two cameras that look at the same moment, and of earlier frames beside them.
 
-Nothing moves between the two views, and no earlier frame helps, so more is made of the pair
-itself: what was matched forth and back and what refinement makes of it are averaged, for their
-errors have little in common. What the match does not know, the sweep may confirm; where the sweep
-sees something much nearer, nothing is believed.
+Nothing moves between the two views, and no frame before is needed, so more is made of the pair
+itself: what was matched forth and back stands where the sweep does not see something much nearer,
+and the sweep confirms what the match does not know. The pair alone is averaged with what
+refinement makes of it, for their errors have little in common.
 """
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from .frames import Frame, Image8, Reference, RelativePose
-from .inverse_range import NOTHING, InverseRange, inverse_range
+from .inverse_range import NOTHING, InverseRange, _grid_angles, inverse_range
 from .joint import Floats, JointMatcher, in_steps
 from .matching import Matcher, Parallax, stereo_grid
 from .sphere import polar_axes
 from .warp import PolarGrid
 
-_WINDOW = 15  # px: one reference tells less of a pixel than several
+_WINDOWS = (15,)  # px: one reference tells less of a pixel than several
 _ALIKE = 1.0  # px by which a match and its refinement may differ
 # Something near may hide there: so many times nearer, and nearer than so many baselines.
 _NEARER, _NEAR = 1.4, 35.0
+_CONE = 0.94  # cosine of the angle from the pair's poles within which motion is asked
+_CONTRADICTS = 3.0  # standard deviations
+
+
+def with_cones(pair: InverseRange, motion: InverseRange, direction: Floats) -> InverseRange:
+    """What motion tells near the poles of the pair, where the pair tells little.
+
+    Where they contradict each other, nothing is known. Elsewhere the pair's word stands.
+
+    direction : (3,) from one camera to the other, current optical frame
+    """
+    cos_lat, sin_lat, cos_lon, sin_lon = _grid_angles(len(pair.rho))
+    x, y, z = (np.float32(v) for v in direction)
+    cosine = cos_lat[:, None] * (sin_lon * x + cos_lon * z) - (sin_lat * y)[:, None]
+    better = (np.abs(cosine) > _CONE) & (motion.sigma < pair.sigma)
+    differ = better & (pair.sigma < NOTHING) & (
+        np.abs(pair.rho - motion.rho) > _CONTRADICTS * np.hypot(pair.sigma, motion.sigma))
+    sigma = np.where(better, motion.sigma, pair.sigma)
+    return InverseRange(np.where(better, motion.rho, pair.rho),
+                        np.where(differ, np.float32(NOTHING), sigma),
+                        pair.signed and motion.signed)
 
 
 class PairMatcher(JointMatcher):
-    """Measures the current frame with one other camera.
+    """Measures the current frame with another camera.
 
+    method : 'joint', or 'joint_fast' (no sweep; what refinement bears out is believed)
     first : matches the pair
     baseline_sigma : relative standard deviation of the baseline where its pose tells none
     """
 
-    def __init__(self, first: Matcher, baseline_sigma: float = 0.0) -> None:
-        super().__init__('joint', first, baseline_sigma)
-        self._windows = (_WINDOW,)
+    def __init__(self, method: str, first: Matcher, baseline_sigma: float = 0.0) -> None:
+        super().__init__(method, first, baseline_sigma)
+        self._several = self._windows
         self._found: Parallax | None = None
 
-    def measured(self, current: Frame, reference: Reference) -> InverseRange:
-        """Inverse range on the current frame's grid, and its sigma."""
-        new = self.measure(current, (reference,))
-        height, pose = current.image.shape[0], in_steps(reference.pose)
+    def measured(self, current: Frame, references: Sequence[Reference]) -> InverseRange:
+        """Inverse range on the current frame's grid, and its sigma.
+
+        references : the other camera first, then earlier frames
+        """
+        alone = len(references) == 1
+        self._windows = _WINDOWS if alone else self._several
+        new = self.measure(current, references)
+        height, pose = current.image.shape[0], in_steps(references[0].pose)
         grid = stereo_grid(height)
         assert self._found is not None
         matched = inverse_range(self._found, grid, polar_axes(pose.direction), pose, height,
                                 self._baseline_sigma)
+        pixel = np.float32(grid.pixel / pose.baseline)
         known = matched.sigma < NOTHING
-        alike = np.abs(new.rho - matched.rho) < np.float32(_ALIKE * grid.pixel / pose.baseline)
-        rho = np.where(known, np.where(alike, (new.rho + matched.rho) / 2, matched.rho), new.rho)
-        near = np.float32(1 / (_NEAR * pose.baseline))
-        hidden = (new.other > near) & (new.other > np.float32(_NEARER) * rho) \
-            & (new.other > rho + np.float32(grid.pixel / pose.baseline))
-        believed = (known & ~hidden) | (new.agreed > 0)
-        sigma = np.where(known, matched.sigma, new.sigma)
+        alike = known & (np.abs(new.rho - matched.rho) < _ALIKE * pixel)
+        best = (new.rho + matched.rho) / 2 if alone else new.rho
+        rho = np.where(known & ~alike, matched.rho, np.where(alike, best, new.rho))
+        hidden = (new.other > np.float32(1 / (_NEAR * pose.baseline))) \
+            & (new.other > np.float32(_NEARER) * rho) & (new.other > rho + pixel)
+        agreed = new.agreed > 0
+        believed = (known & ~hidden) | agreed if self._sweeps else known & agreed
+        sharper = matched.sigma if alone else np.minimum(matched.sigma, new.sigma)
+        sigma = np.where(known & ~alike, matched.sigma, np.where(alike, sharper, new.sigma))
         return InverseRange(rho, np.where(believed, sigma, np.float32(NOTHING)), self.signed)
+
+    def _swept(self, pairs: Sequence[tuple[Image8, RelativePose]],
+               ) -> list[tuple[Image8, RelativePose]]:
+        return list(pairs[:1])
 
     def _parallax(self, view: Image8, nearest: tuple[Image8, RelativePose], grid: PolarGrid,
                   axes: Floats) -> Parallax:

@@ -73,6 +73,9 @@ class Pairer:
         """What is amiss, empty if nothing is."""
         return ''
 
+    def warm_up(self) -> None:
+        """Compile what pairing needs."""
+
     def add_frame(self, frame: Frame) -> list[Outcome]:
         """Take the next frame of the camera."""
         drop = self._discontinuity(frame)

@@ -22,7 +22,7 @@ from .islands import far_islands
 from .joint import JointMatcher
 from .matching import matcher, stereo_grid
 from .moving import moving_parts, under_floor
-from .pair_matching import PairMatcher
+from .pair_matching import PairMatcher, with_cones
 from .planes import on_planes
 from .range_memory import RangeMemory
 from .rig import Rig
@@ -45,8 +45,9 @@ class SphericalStereo:
             self._joint = JointMatcher(config.stereo.matcher, self._match,
                                        config.baseline.relative_sigma)
         self._pair: PairMatcher | None = None
-        if config.pairing.mode == 'binocular' and config.stereo.matcher == 'joint':
-            self._pair = PairMatcher(self._match, config.baseline.relative_sigma)
+        if config.pairing.mode == 'binocular' and self._joint:
+            self._pair = PairMatcher(config.stereo.matcher, self._match,
+                                     config.baseline.relative_sigma)
         self._rig = Rig(config.pairing.mode == 'binocular')
         self._memory = RangeMemory(config.stereo.memory)
         self._mask = mask
@@ -58,6 +59,10 @@ class SphericalStereo:
         pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -1.0]), 1e-9 * np.eye(6))
         for reference, current in pairwise(frames):  # the second time, there is a memory
             self.process(AlignedWindow(current, (Reference(reference, pose),)))
+        if self._pair is not None:
+            top = Reference(Frame(FrameKey(0, 'top'), noise), pose)
+            self.process(AlignedWindow(frames[1], (top, Reference(frames[0], pose))))
+            self._rig = Rig(binocular=True)
         self._memory = RangeMemory(self.config.stereo.memory)
         nothing = np.zeros(noise.shape, np.float32)
         under_floor(nothing, nothing, np.zeros(3))  # noise has no floor
@@ -76,9 +81,11 @@ class SphericalStereo:
         mask, moving = self._mask_of(height), None
         camera = self._rig.camera(window)
         first = window.references[0]
-        if self._pair is not None and len(window.references) == 1 \
-                and first.is_beside(window.current):
-            estimate = self._pair.measured(window.current, first)
+        if self._pair is not None and first.is_beside(window.current):
+            estimate = self._pair.measured(window.current, window.references)
+            if len(window.references) > 1:
+                motion = self._measure(window.current, window.references[1])
+                estimate = with_cones(estimate, motion, first.pose.direction)
         elif self._joint is not None:
             estimate, moving = self._remembered(self._joint, window, mask)
         else:

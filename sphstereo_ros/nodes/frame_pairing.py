@@ -71,7 +71,8 @@ class FramePairing:
         self._pairer = self._binocular() if binocular else Pairer(shell.config)
 
     def warm_up(self) -> None:
-        """Nothing here is compiled."""
+        """Compile what pairing needs."""
+        self._pairer.warm_up()
 
     def subscribe(self) -> None:
         """Take images and motion from the graph."""
