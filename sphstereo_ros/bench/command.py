@@ -4,7 +4,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from sphstereo_ros.replay.parameter_files import load_values
 from sphstereo_ros.replay.records import BadInput
 from sphstereo_ros.scenes.sequence import NUISANCES, REPORTED_SEEDS, SCENES
 
-from .methods import COMPARED, METHODS, method
+from .methods import COMPARED, METHODS, PAIR_METHODS, method
 from .sequences import GROUND_TRUTH, Scenes, saved
 
 
@@ -53,8 +53,11 @@ def _add_accuracy(parser: argparse.ArgumentParser) -> None:
                         'and take it from here the next time')
     parser.add_argument('--plots', type=Path, metavar='DIR', help='write plots as PNG (extra '
                         "'plots')")
-    parser.add_argument('--methods', default=','.join(COMPARED),
-                        help=f'of {",".join(METHODS)} (default: %(default)s)')
+    parser.add_argument('--methods', help=f'of {",".join(METHODS)} (default: '
+                        f'{",".join(COMPARED)}); with --binocular of {",".join(PAIR_METHODS)} '
+                        '(default: all)')
+    parser.add_argument('--binocular', action='store_true', help='pairs of two cameras, one above '
+                        'the other: of folders whose meta.json has pairs, or rendered')
     parser.add_argument('--params', type=Path, action='append', default=[], metavar='FILE',
                         help='parameters of the method `default`')
     parser.add_argument('-p', action='append', default=[], dest='overrides',
@@ -66,7 +69,10 @@ def main(args: argparse.Namespace) -> int:
     if args.kind == 'live':
         from . import live
         return int(live.main(args))
-    result = _accuracy(args) if args.kind == 'accuracy' else _speed(args)
+    if args.kind == 'accuracy':
+        result = _binocular(args) if args.binocular else _accuracy(args)
+    else:
+        result = _speed(args)
     if args.json:
         print(json.dumps(_rounded(result)))
     return 0
@@ -82,10 +88,7 @@ def _rounded(value: Any) -> Any:
 def _accuracy(args: argparse.Namespace) -> dict[str, Any]:
     from .accuracy import Contest, frames_to_skip
     from .tables import tables
-    names = args.methods.split(',')
-    unknown = sorted(set(names) - set(METHODS))
-    if unknown:
-        raise BadInput(f'--methods: {unknown[0]} is none of {", ".join(METHODS)}')
+    names = _chosen(args.methods, COMPARED, METHODS)
     write = _plotter() if args.plots is not None else None
     given = load_values(args.params, args.overrides)
     contest = Contest({name: method(name, given) for name in names})
@@ -97,6 +100,35 @@ def _accuracy(args: argparse.Namespace) -> dict[str, Any]:
     print(tables(summaries))
     if write is not None:
         print('\nwritten:', ', '.join(map(str, write(summaries, args.plots))))
+    return summaries
+
+
+def _chosen(given: str | None, default: Sequence[str], there: Sequence[str]) -> Sequence[str]:
+    names = list(default) if given is None else given.split(',')
+    unknown = sorted(set(names) - set(there))
+    if unknown:
+        raise BadInput(f'--methods: {unknown[0]} is none of {", ".join(there)}')
+    return names
+
+
+def _binocular(args: argparse.Namespace) -> dict[str, Any]:
+    from .binocular import PairContest, parameters, rendered_pairs, saved_pairs, table
+    names = _chosen(args.methods, PAIR_METHODS, PAIR_METHODS)
+    given = load_values(args.params, args.overrides)
+    contest = PairContest({name: parameters(name, given) for name in names})
+    with tqdm(unit='pair', disable=None) as progress:
+        if args.folders:
+            for folder in args.folders:
+                contest.add(saved_pairs(folder), progress.update)
+        else:
+            try:
+                for seed in args.seeds:
+                    contest.add(rendered_pairs(args.scene, seed, args.frames, args.height),
+                                progress.update)
+            except ImportError as error:
+                raise BadInput(f"rendering needs the extra 'scenes': {error}") from error
+    summaries = contest.summaries()
+    print(table(summaries))
     return summaries
 
 

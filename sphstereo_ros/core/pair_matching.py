@@ -13,15 +13,18 @@ import numpy as np
 
 from .frames import Frame, Image8, Reference, RelativePose
 from .inverse_range import NOTHING, InverseRange, _grid_angles, inverse_range
-from .joint import Floats, JointMatcher, in_steps
+from .joint import Floats, JointMatcher, Measurement, in_steps
 from .matching import Matcher, Parallax, stereo_grid
+from .refinement import JointRefinement, Refined
 from .sphere import polar_axes
-from .warp import PolarGrid
+from .warp import Map, PolarGrid
 
 _WINDOWS = (15,)  # px: one reference tells less of a pixel than several
 _ALIKE = 1.0  # px by which a match and its refinement may differ
 # Something near may hide there: so many times nearer, and nearer than so many baselines.
 _NEARER, _NEAR = 1.4, 35.0
+# It fits: squared grey levels, as a multiple of what the match has, and beside it.
+_FITS, _GREY = 2.0, 8.0
 _CONE = 0.94  # cosine of the angle from the pair's poles within which motion is asked
 _CONTRADICTS = 3.0  # standard deviations
 
@@ -57,6 +60,7 @@ class PairMatcher(JointMatcher):
         super().__init__(method, first, baseline_sigma)
         self._several = self._windows
         self._found: Parallax | None = None
+        self._view = np.empty((0, 0), np.uint8)
 
     def measured(self, current: Frame, references: Sequence[Reference]) -> InverseRange:
         """Inverse range on the current frame's grid, and its sigma.
@@ -90,5 +94,16 @@ class PairMatcher(JointMatcher):
 
     def _parallax(self, view: Image8, nearest: tuple[Image8, RelativePose], grid: PolarGrid,
                   axes: Floats) -> Parallax:
+        self._view = view
         self._found = super()._parallax(view, nearest, grid, axes)
         return self._found
+
+    def _on_sphere(self, refined: Refined, other: Map, tolerance: Map, grid: PolarGrid,
+                   axes: Floats, pairs: Sequence[tuple[Image8, RelativePose]],
+                   height: int) -> Measurement:
+        """Of what the sweep sees, what is nearer counts only where the pictures bear it out."""
+        if self._sweeps:
+            fit = JointRefinement(self._view, grid, axes, pairs[:1]).misfit(other)
+            fits = fit < _FITS * refined.misfit + _GREY
+            other = np.where(fits | (other < _NEARER * refined.rho), other, np.float32(0))
+        return super()._on_sphere(refined, other, tolerance, grid, axes, pairs, height)

@@ -139,6 +139,12 @@ class JointRefinement:
         hold = np.float32(1e-3)
         return Refined((sums + hold * rho) / (information + hold), information, best)
 
+    def misfit(self, rho: Map) -> Map:
+        """Mean squared grey difference round each pixel, if it lies at `rho`, of the nearest
+        reference.
+        """
+        return self._difference(*self._references[0], rho)[2]
+
     def _difference(self, image: Image8, pose: RelativePose, rho: Map) -> tuple[Map, Map, Map]:
         view = reference_in_relief(image, pose, self._grid, self._axes, rho)
         view_mean = _mean(view)
