@@ -79,7 +79,7 @@ def test_pairs_are_those_of_the_nearest_stamps_in_whatever_order_cameras_deliver
     while any(queues.values()):
         # One camera may be one frame later than the other, not more.
         ready = [s for s in SIDES if queues[s] and not any(
-            queues[o] and queues[o][0] < queues[s][0] - STEP - 50 * MS for o in SIDES)]
+            queues[o] and queues[o][0] < queues[s][0] - STEP - 20 * MS for o in SIDES)]
         side = random.choice(ready)  # type: ignore[attr-defined]
         out += fed(synchroniser, (side, queues[side].pop(0)))
     out += told(synchroniser.flush())
