@@ -62,7 +62,8 @@ _SEEN = 3
 _STRENGTH = 0.02
 
 _DISAGREES = 0.05 * math.pi / 180  # rad by which a pair may differ from the others, or 5 sigma
-_MAX_DIRECTION_SIGMA = 0.2 * math.pi / 180
+_MAX_DIRECTION_SIGMA = 0.3 * math.pi / 180
+_TILT = 0.15  # of an error of the direction that roll and pitch take over
 # A direction that the pictures tell, so many sigma from the one given, is wrong where it changes
 # the rotation by so many times what may be uncertain.
 _SIGNIFICANT, _SHIFTED = 4, 2
@@ -378,12 +379,13 @@ class AlignmentCalibration:
     def _judged(self, pose: PoseEstimate, free: PoseEstimate | None, points: Correspondences,
                 pairs: int) -> CalibrationResult | Drop:
         used = points[pose.inliers]
-        covariance = self._with_floor(_covariance(pose, points, self.estimate_direction), pose)
-        lean, lean_sigma = self._lean(free, points)
+        moved = float(np.median(parallax(pose.rotation, used)))
+        covariance = self._with_floor(_covariance(pose, points, self.estimate_direction), pose,
+                                      moved)
+        lean, lean_sigma = self._lean(free, points, moved)
         result = CalibrationResult(
             pose.rotation, pose.direction, covariance, self.estimate_direction, lean, lean_sigma,
-            pairs, len(used), _share_seen(used.current), pose.residual,
-            float(np.median(parallax(pose.rotation, used))))
+            pairs, len(used), _share_seen(used.current), pose.residual, moved)
         strength = _strength(pose, used)
         if strength < _STRENGTH:
             return Drop('too_little_of_sphere', f'points in {100 * result.share:.0f} % of the '
@@ -393,32 +395,45 @@ class AlignmentCalibration:
             turn = rotations.angle(pose.rotation @ free.rotation.T)
             if turn > _SHIFTED * limit:
                 return self._leaning(free, f', and turns the cameras by {_degrees(turn)}')
-        if result.sigma > limit:
-            return Drop('calibration_uncertain', f'standard deviation {_degrees(result.sigma)} is '
-                        f'over {_degrees(limit)}: too little texture, or things that move')
         if self.estimate_direction and result.direction_sigma > _MAX_DIRECTION_SIGMA:
             return Drop('no_parallax', 'the scene is too far away to tell the direction of the '
                         f'baseline (median parallax {_degrees(result.parallax)}); the rotation '
                         'alone would be known')
+        if result.sigma > limit:
+            return Drop('calibration_uncertain', f'standard deviation {_degrees(result.sigma)} is '
+                        f'over {_degrees(limit)}: too little texture, or things that move')
         return result
 
-    def _lean(self, free: PoseEstimate | None, points: Correspondences) -> tuple[float, float]:
+    def _lean(self, free: PoseEstimate | None, points: Correspondences,
+              moved: float) -> tuple[float, float]:
         """Angle between the direction found and the one given, and its standard deviation."""
         if free is None:
             return math.nan, math.nan
         cross = np.linalg.norm(np.cross(free.direction, self._direction))
-        sigma = math.sqrt(np.linalg.eigvalsh(_covariance(free, points, True)[3:, 3:]).max())
+        sigma = math.hypot(self._direction_floor(moved), math.sqrt(
+            np.linalg.eigvalsh(_covariance(free, points, True)[3:, 3:]).max()))
         if sigma > _MAX_DIRECTION_SIGMA:
             return math.nan, math.nan
         return math.atan2(cross, float(free.direction @ self._direction)), sigma
 
-    def _with_floor(self, covariance: Floats, pose: PoseEstimate) -> Floats:
+    def _direction_floor(self, moved: float) -> float:
+        """What a systematic error of all points makes of a direction, rad.
+
+        moved : median parallax, rad: an error of the points counts as a share of it
+        """
+        config = self.config.alignment
+        return math.hypot(config.direction_sigma, config.rotation_sigma / max(moved, 1e-9))
+
+    def _with_floor(self, covariance: Floats, pose: PoseEstimate, moved: float) -> Floats:
         """Add what is systematic, which residuals do not show."""
+        turn = self.config.alignment.rotation_sigma**2
         floor = np.zeros((6, 6))
-        floor[:3, :3] = self.config.alignment.rotation_sigma**2 * np.eye(3)
         if self.estimate_direction:
             across = np.eye(3) - np.outer(pose.direction, pose.direction)
-            floor[3:, 3:] = self.config.alignment.direction_sigma**2 * across
+            lean = self._direction_floor(moved)**2
+            floor[3:, 3:] = lean * across
+            floor[:3, :3] = _TILT**2 * lean * across
+        floor[:3, :3] += turn * np.eye(3)
         return covariance + floor
 
 
