@@ -313,10 +313,12 @@ def test_what_stays_in_the_picture_is_masked():
     rng = np.random.default_rng(3)
     vehicle = cv2.GaussianBlur(rng.integers(0, 256, (HEIGHT, 2 * HEIGHT), np.uint8), (5, 5), 1.5)
     mask = np.zeros((HEIGHT, 2 * HEIGHT), np.uint8)
-    mask[HEIGHT * 11 // 20:, HEIGHT // 2:HEIGHT * 3 // 2] = 255
+    mask[HEIGHT // 2:, HEIGHT // 5:HEIGHT * 9 // 5] = 255
     top, bottom = (np.where(mask, vehicle, im) for im in (top_view(rpy), bottom_view()))
     result = from_pictures(top, bottom, cv2.resize(mask, (300, 150)))
     assert error(result, rpy) < 0.05
+    without = from_pictures(top, bottom)
+    assert isinstance(without, Drop) or error(without, rpy) > 1
 
 
 def test_pictures_without_texture_or_of_other_places_are_refused():
