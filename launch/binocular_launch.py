@@ -53,9 +53,9 @@ def generate_launch_description():
                               description='parameter files of all nodes, separated by commas; of '
                               'sphstereo calibrate last'),
         DeclareLaunchArgument('namespace', default_value='', description='of all topics'),
-        DeclareLaunchArgument('bottom_frame', default_value='bottom_camera',
+        DeclareLaunchArgument('bottom_frame', default_value='camera_optical',
                               description="frame_id of the bottom camera's images"),
-        DeclareLaunchArgument('top_frame', default_value='top_camera',
+        DeclareLaunchArgument('top_frame', default_value='top_camera_optical',
                               description="frame_id of the top camera's images"),
         DeclareLaunchArgument('use_sim_time', default_value='false',
                               description='true where /clock is published'),
