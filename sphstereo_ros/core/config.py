@@ -265,6 +265,9 @@ class ObstaclesConfig:
                                  'ground is no obstacle', unit='m', low=0.0, high=2.0)
     vehicle_width: float = _p('obstacles.vehicle_width', 0.6, 'of the way that must be free, for '
                               'the time to contact', unit='m', low=0.0, high=100.0)
+    trust_sky: bool = _p('obstacles.trust_sky', False, 'more than 11° above the horizon, a sector '
+                         'may be free where nothing is measured: plain sky has no range, but '
+                         'neither has a branch before it that was missed')
     require_attitude: bool = _p('obstacles.require_attitude', True, 'without roll and pitch there '
                                 'is no result; false: base_link is taken for level')
     max_rate: float = _p('obstacles.max_rate', 0.0, 'depth images a second at most in which '

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .clusters import bin_middle, nearest_things
 from .config import Config
 from .contact import time_to_contact
 from .frames import Drop, FrameKey, Image8, RangeImage
@@ -22,15 +23,12 @@ from .level import Attitude
 from .open_space import STEEPEST, distances_asked, free_sectors
 from .rotations import mount
 from .sectors import SECTORS, ObstacleSectors, SectorState
-from .survey import WEIGHT, Band, nearest_supported, survey
+from .survey import Band, survey
 from .warp import Map
 
 Floats = NDArray[np.float64]
 
-_STEP = 0.005  # relative width of the bins of distance
-# The least obstacle: metres wide and high, how much of it must be measured, at least how many
-# pixels.
-_WIDTH, _HEIGHT, _SHARE, _PIXELS = 0.08, 0.2, 0.5, 6
+_DOUBT = 0.01  # m²: a sector with so much that is too small to be believed is not free
 _COLUMNS, _PIXELS_PER_COLUMN = 10, 1.3  # of a sector, at most, and where the image has as many
 _CELL = math.radians(1.0)  # height of the cells of `open_space`, at least
 _SAMPLED_ROWS = 120  # of the image, to find the ground; twice as many for points
@@ -93,36 +91,42 @@ class _Picture:
         self._angles = _angles(len(image.range))
 
     def sectors(self) -> ObstacleSectors:
-        limits, height = self._config.obstacles, len(self._image.range)
+        limits, image, height = self._config.obstacles, self._image, len(self._image.range)
         ground = self._ground()
         distances = distances_asked(limits.maximum)
         cell = max(_CELL, _PIXELS_PER_COLUMN * math.pi / height)
         columns = SECTORS * min(_COLUMNS, max(1, int(
             2 * height / SECTORS / _PIXELS_PER_COLUMN)))
-        band = self._band(ground)
-        bins = 2 + int(math.log(limits.maximum / limits.minimum) * band.bins_per_e)
-        near = np.zeros((columns, bins), np.int32)
-        seen = np.zeros((len(distances) + 1, math.ceil(2 * STEEPEST / cell), columns), np.int32)
-        stride = max(1, height // (2 * _SAMPLED_ROWS))
-        room = -(-height // stride) * -(-2 * height // stride)
-        points, places = np.empty((room, 3), np.float32), np.empty((room, 2), np.int32)
-        count = survey(self._image.range, self._image.sigma, *self._angles, self._turn,
-                       self._camera.astype(np.float32), band.array(),
-                       distances.astype(np.float32), cell, stride, near, seen, points, places)
-        found = np.empty(SECTORS, np.int32)
-        edges = limits.minimum * np.exp(np.arange(-1, bins - 1) / band.bins_per_e)
-        nearest_supported(near, _needed(np.maximum(edges, limits.minimum), height), SECTORS,
-                          found)
+        seen = np.zeros((len(distances) + 2, math.ceil(2 * STEEPEST / cell), columns), np.int32)
+        flat = np.empty(image.range.shape, np.float32)
+        column = np.empty(image.range.shape, np.int16)
+        survey(image.range, image.sigma, *self._angles, self._turn,
+               self._camera.astype(np.float32), self._band(ground).array(),
+               distances.astype(np.float32), cell, seen, flat, column)
         free = free_sectors(seen, distances, limits, ground, self._camera, cell)
-        own = places[:count, 0] * SECTORS // columns
-        kept = (found[own] >= 0) & (places[:count, 1] >= found[own])
-        return self._result(found, free, points[:count][kept])
+        nearest, doubt = np.empty(columns, np.int32), np.empty(columns)
+        believed = np.empty(flat.shape, np.bool_)
+        nearest_things(flat, column, self._angles[0], limits.minimum, limits.maximum, nearest,
+                       doubt, believed)
+        free &= doubt.reshape(SECTORS, -1).sum(axis=1) < _DOUBT
+        return self._result(_of_sectors(nearest), free, self._points(believed))
+
+    def _points(self, believed: NDArray[np.bool_]) -> Map:
+        step = max(1, len(believed) // (2 * _SAMPLED_ROWS))
+        i, j = np.nonzero(believed[::step, ::step])
+        (cos_lat, sin_lat), (cos_lon, sin_lon) = (
+            angles[k * step].T for angles, k in zip(self._angles, (i, j), strict=True))
+        rays = np.stack([cos_lat * sin_lon, -sin_lat, cos_lat * cos_lon], axis=1)
+        r = self._image.range[i * step, j * step]
+        r = np.where(np.isfinite(r), r, np.float32(self._config.range.minimum))
+        return np.asarray(r[:, None] * (rays @ self._turn.T)
+                          + self._camera.astype(np.float32), np.float32)
 
     def _result(self, found: NDArray[np.int32], free: NDArray[np.bool_],
                 points: Map) -> ObstacleSectors:
         limits = self._config.obstacles
         measured = found >= 0
-        middle = limits.minimum * np.exp(np.maximum(found - 0.5, 0) * _STEP)
+        middle = bin_middle(found, limits.minimum)
         distance = np.where(measured, np.clip(middle, limits.minimum, limits.maximum),
                             np.nan).astype(np.float32)
         state = np.where(measured, SectorState.MEASURED,
@@ -142,9 +146,8 @@ class _Picture:
     def _band(self, ground: Ground | None) -> Band:
         limits, measured = self._config.obstacles, self._config.range
         plane = (0.0, 0.0, -math.inf) if ground is None else (*ground.slope, ground.height)
-        return Band(limits.height_below, limits.height_above, limits.minimum, limits.maximum,
-                    limits.ground_clearance, measured.minimum, measured.maximum, plane,
-                    1 / _STEP)
+        return Band(limits.height_below, limits.height_above, limits.maximum,
+                    limits.ground_clearance, measured.minimum, measured.maximum, plane)
 
 
 @lru_cache(maxsize=4)
@@ -156,8 +159,10 @@ def _angles(height: int) -> tuple[Map, Map]:
                  for a in (lat, lon))
 
 
-def _needed(distance: Floats, height: int) -> Floats:
-    """Weight of the pixels that the least obstacle has at `distance`, within two columns."""
-    two_columns = 2 * 2 * np.pi / (SECTORS * _COLUMNS)
-    area = np.minimum(_WIDTH / distance, two_columns) * _HEIGHT / distance
-    return np.asarray(WEIGHT * np.maximum(_SHARE * area / (np.pi / height)**2, _PIXELS))
+def _of_sectors(nearest: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The nearest of each sector's columns, and of those just beyond its edges; −1: none."""
+    far = np.iinfo(np.int32).max
+    columns = np.where(nearest < 0, far, nearest).reshape(SECTORS, -1)
+    out = np.minimum(columns.min(axis=1), np.minimum(np.roll(columns[:, -1], 1),
+                                                     np.roll(columns[:, 0], -1)))
+    return np.asarray(np.where(out == far, -1, out), np.int32)

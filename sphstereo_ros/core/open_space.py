@@ -21,8 +21,10 @@ Floats = NDArray[np.float64]
 STEEPEST = math.radians(60)  # elevations beyond are not looked at
 # What could hide, up to 10 m; farther off, something of that angular size.
 _WIDTH, _HEIGHT, _FAR = 0.15, 0.5, 10.0
-_CLEAR = 0.6  # of its pixels must be measured as farther
+_CLEAR = 0.75  # of its pixels must be measured as farther
 _STEPS, _RATIO, _NEAREST = 8, 1.5, 0.5  # distances at which that is asked
+# Sky: from that elevation on; columns beside that are looked at; share of stray pixels.
+_SKY, _BESIDE, _STRAY = math.radians(11), 2, 0.02
 _LEAST_ROOM = 0.05  # m between ground and the top of the band
 
 
@@ -38,15 +40,16 @@ def free_sectors(seen: Counts, distances: Floats, limits: ObstaclesConfig,
 
     Parameters
     ----------
-    seen : (len(distances) + 1, E, C) weight of the pixels by how many of the distances they are
-        certainly farther than, by elevation from −60° up in steps of `cell` rad, and by azimuth
-        clockwise from the edge of the first sector
+    seen : (len(distances) + 2, E, C) weight of the pixels by how many of the distances they are
+        certainly farther than (the last: unknown), by elevation from −60° up in steps of `cell`
+        rad, and by azimuth clockwise from the edge of the first sector
     camera : (3,) its position in the level frame
 
     """
     plane = (0.0, 0.0, -math.inf) if ground is None else (*ground.slope, ground.height)
     bounds = np.array([-limits.height_below, limits.height_above, limits.ground_clearance])
-    return np.asarray(_free(seen, distances, bounds, np.array(plane), camera, cell))
+    return np.asarray(_free(seen, distances, bounds, np.array(plane), camera, cell,
+                            limits.trust_sky))
 
 
 @kernel
@@ -93,20 +96,49 @@ def _hides(sums: NDArray[np.int64], clear: NDArray[np.int64], angle: float, dist
 
 
 @kernel
+def _with_sky(farther: Counts, known: Counts, unknown: Counts,
+              horizon: int) -> Counts:  # pragma: no cover - compiled
+    """What is farther, and what is unknown above `horizon` where all that is known is farther.
+
+    A plain sky has no range. What could stand before it would have to hang in the air, and show
+    no edge.
+    """
+    rows, columns = farther.shape
+    out = farther.copy()
+    nearer = np.zeros(columns)
+    whole = np.zeros(columns)
+    for e in range(horizon, rows):
+        for c in range(columns):
+            nearer[c] += known[e, c] - farther[e, c]
+            whole[c] += known[e, c] + unknown[e, c]
+    for c in range(columns):
+        near, total = 0.0, 0.0
+        for k in range(c - _BESIDE, c + _BESIDE + 1):
+            near += nearer[(k + columns) % columns]
+            total += whole[(k + columns) % columns]
+        if near <= _STRAY * total:
+            out[horizon:, c] += unknown[horizon:, c]
+    return out
+
+
+@kernel
 def _free(seen: Counts, distances: Floats, bounds: Floats, plane: Floats, camera: Floats,
-          cell: float) -> NDArray[np.bool_]:  # pragma: no cover - compiled
+          cell: float, trust_sky: bool) -> NDArray[np.bool_]:  # pragma: no cover - compiled
     layers, rows, columns = seen.shape
+    horizon = int((STEEPEST + _SKY) / cell) + 1
     sums = np.zeros((rows + 1, 2 * columns + 1), np.int64)
     clear = np.zeros((rows + 1, 2 * columns + 1), np.int64)
-    farther = np.zeros((rows, columns), np.int32)
-    for layer in range(layers):
+    farther, known = np.zeros((rows, columns), np.int32), np.zeros((rows, columns), np.int32)
+    for layer in range(layers - 1):
         farther += seen[layer]
-    _sums(farther, sums)
+    known[:] = farther
+    _sums(known + seen[layers - 1], sums)
     out = np.ones(SECTORS, np.bool_)
     size = np.empty(2)
-    for k in range(layers - 1):
+    for k in range(layers - 2):
         farther -= seen[k]  # what is left is farther than distances[k]
-        _sums(farther, clear)
+        _sums(_with_sky(farther, known, seen[layers - 1], horizon) if trust_sky else farther,
+              clear)
         size[0] = _WIDTH * max(1.0, distances[k] / _FAR)
         size[1] = _HEIGHT * max(1.0, distances[k] / _FAR)
         for column in range(columns):

@@ -29,26 +29,23 @@ class Band:
 
     below: float
     above: float
-    nearest: float
     farthest: float
     clearance: float
     range_min: float
     range_max: float
     plane: tuple[float, float, float]
-    bins_per_e: float  # bins of distance over a ratio of e
 
     def array(self) -> Map:
         """For the kernel."""
-        return np.array([-self.below, self.above, self.nearest, self.farthest, self.clearance,
-                         self.range_min, self.range_max, *self.plane, self.bins_per_e],
-                        np.float32)
+        return np.array([-self.below, self.above, self.farthest, self.clearance, self.range_min,
+                         self.range_max, *self.plane], np.float32)
 
 
 @kernel
 def survey(r: Map, sigma: Map, rows: Map, columns: Map, turn: Map, camera: Map, band: Map,
-           distances: Map, cell: float, stride: int, near: Counts, seen: Counts, points: Map,
-           places: Counts) -> int:  # pragma: no cover - compiled
-    """Fill `near` and `seen`; returns how many obstacle points there are.
+           distances: Map, cell: float, seen: Counts, flat: Map,
+           column: NDArray[np.int16]) -> None:  # pragma: no cover - compiled
+    """What is free along every ray, and which pixels show what stands in the band.
 
     Parameters
     ----------
@@ -57,17 +54,14 @@ def survey(r: Map, sigma: Map, rows: Map, columns: Map, turn: Map, camera: Map, 
     turn : (3, 3) level frame ← camera_optical; camera : (3,) position in the level frame
     band : as `Band.array`
     distances : at which `seen` is asked, rising
-    stride : every so many-th row and column gives a point
-    near : (C, bins) weight of obstacle pixels by azimuth and distance; bin 0 is nearer than
-        `nearest`
-    seen : see `free_sectors`
-    points : (N, 3) metres, level frame; places : (N, 2) column and bin of each
+    seen : filled; see `free_sectors`
+    flat : (H, 2H) filled: horizontal distance of what stands in the band, metres; else 0
+    column : (H, 2H) filled where `flat` is not 0: azimuth, of as many as `seen` has columns
 
     """
-    low, high, nearest, farthest, clearance = band[0], band[1], band[2], band[3], band[4]
-    range_min, range_max, slope_x, slope_y, floor = band[5], band[6], band[7], band[8], band[9]
-    bins_per_e, inverse_nearest = band[10], np.float32(1) / band[2]
-    count, width = 0, near.shape[0]
+    low, high, farthest, clearance = band[0], band[1], band[2], band[3]
+    range_min, range_max, slope_x, slope_y, floor = band[4], band[5], band[6], band[7], band[8]
+    width = seen.shape[2]
     per_radian = np.float32(width / (2 * math.pi))
     shift = np.float32(SECTOR_WIDTH / 2 - FIRST_SECTOR + 2 * math.pi)
     steepest, per_cell = np.float32(STEEPEST), np.float32(1 / cell)
@@ -76,74 +70,43 @@ def survey(r: Map, sigma: Map, rows: Map, columns: Map, turn: Map, camera: Map, 
         cos_lat, sin_lat = rows[i, 0], rows[i, 1]
         weight = max(1, int(WEIGHT * cos_lat + 0.5))
         for j in range(r.shape[1]):
+            flat[i, j] = 0
             x, y, z = cos_lat * columns[j, 1], -sin_lat, cos_lat * columns[j, 0]
             up = turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z
             ahead = turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z
             left = turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z
-            flat = np.sqrt(ahead * ahead + left * left)
-            elevation = _arctan2(up, flat) + steepest
+            across = np.sqrt(ahead * ahead + left * left)
+            elevation = _arctan2(up, across) + steepest
             row = int(elevation * per_cell)
             if elevation < 0 or row >= seen.shape[1]:
                 continue
             distance, spread = r[i, j], sigma[i, j]
             sure = np.float32(0)  # the horizontal distance up to which this ray is free
             if distance == np.inf:
-                sure = range_max * flat
+                sure = range_max * across
             elif distance > 0 and spread >= 0:
-                sure = (distance - confident * spread) * flat
+                sure = (distance - confident * spread) * across
             layer = 0
             while layer < distances.size and sure >= distances[layer]:
                 layer += 1
-            column = int((shift - _arctan2(left, ahead)) * per_radian) % width
-            seen[layer, row, column] += weight
+            if np.isnan(distance):
+                layer = distances.size + 1
+            at = int((shift - _arctan2(left, ahead)) * per_radian) % width
+            seen[layer, row, at] += weight
             if distance == -np.inf:
                 distance = range_min
             elif not (distance > 0 and distance < np.inf):
                 continue
             px, py = camera[0] + distance * ahead, camera[1] + distance * left
             pz = camera[2] + distance * up
-            if pz < low or pz > high:
-                continue
-            flat = np.sqrt(px * px + py * py)
-            if flat > farthest:
+            away = np.sqrt(px * px + py * py)
+            if pz < low or pz > high or away > farthest:
                 continue
             ground = slope_x * px + slope_y * py + floor
             slack = np.float32(_GROUND_SIGMAS) * spread * abs(up)
             slack = min(slack, np.float32(_GROUND_SLACK)) if slack > 0 else np.float32(0)
             if pz < ground + clearance + slack and (
-                    ground < np.float32(_RISE) + np.float32(_RISE_RATE) * flat):
+                    ground < np.float32(_RISE) + np.float32(_RISE_RATE) * away):
                 continue
-            column = int((shift - _arctan2(py, px)) * per_radian) % width
-            place = 0
-            if flat >= nearest:
-                place = 1 + int(np.log(flat * inverse_nearest) * bins_per_e)
-                place = min(place, near.shape[1] - 1)
-            near[column, place] += weight
-            if i % stride == 0 and j % stride == 0:
-                points[count, 0], points[count, 1], points[count, 2] = px, py, pz
-                places[count, 0], places[count, 1] = column, place
-                count += 1
-    return count
-
-
-@kernel
-def nearest_supported(near: Counts, needed: Floats, sectors: int,
-                      out: Counts) -> None:  # pragma: no cover - compiled
-    """The nearest bin of each sector up to which enough weight lies side by side; −1: none.
-
-    near : (C, bins), azimuths of the sectors one after the other; needed : (bins,) weight up to
-    that bin, in two columns side by side; those across the sector's edge count, too
-    """
-    columns, bins = near.shape
-    each = columns // sectors
-    for sector in range(sectors):
-        best = bins
-        for k in range(-1, each):
-            a, b = (sector * each + k) % columns, (sector * each + k + 1) % columns
-            total = 0
-            for place in range(best):
-                total += near[a, place] + near[b, place]
-                if total >= needed[place]:
-                    best = place
-                    break
-        out[sector] = best if best < bins else -1
+            flat[i, j] = max(away, np.float32(1e-3))
+            column[i, j] = int((shift - _arctan2(py, px)) * per_radian) % width
