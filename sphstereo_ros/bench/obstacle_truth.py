@@ -114,6 +114,7 @@ class Score:
         return {'frames': c['frames'],
                 'median_error': 100 * float(np.median(self.errors)) if self.errors else None,
                 **{name: 100 * c[name] / total for name in ('measured', 'free', 'unknown')},
-                **{name: c[name] for name in ('near', 'near_free', 'fine_free', 'near_unknown', 'near_missed',
-                                              'false', 'truly_free', 'truly_free_free')},
+                **{name: c[name] for name in (
+                    'near', 'near_free', 'fine_free', 'near_unknown', 'near_missed', 'false',
+                    'truly_free', 'truly_free_free')},
                 'drops': {name[6:]: n for name, n in c.items() if name.startswith('drops.')}}

@@ -10,95 +10,120 @@ from .jit import kernel
 from .warp import Map
 
 Counts = NDArray[np.int32]
+Columns = NDArray[np.int16]
 
 _ALIKE = 1.1  # ratio of the distances of neighbours that belong together
-# The smallest thing that is believed: m² that face the camera, and pixels.
+# The smallest thing that is believed: m² that face the camera, and pixels; and what of it a
+# column must show.
 _AREA, _PIXELS = 0.015, 6
-# and what of it a column must show.
-_IN_COLUMN, _LEAST = 0.003, 3
+_AREA_IN_COLUMN, _PIXELS_IN_COLUMN = 0.003, 3
 _QUANTILE = 0.15  # of a thing's pixels in a column are nearer than what is told
 _STEP = 0.005  # relative width of the bins of distance
 
 
-def bins_between(nearest: float, farthest: float) -> int:
-    """How many bins of distance there are."""
-    return 2 + int(math.log(farthest / nearest) / _STEP)
-
-
-def bin_middle(place: NDArray[np.intp], nearest: float) -> NDArray[np.float64]:
+def bin_middle(place: NDArray[np.int32], nearest: float) -> NDArray[np.float64]:
     """Metres; bin 0 is all that is nearer than `nearest`."""
     return np.asarray(nearest * np.exp(np.maximum(place - 0.5, 0) * _STEP))
 
 
-@kernel
-def nearest_things(flat: Map, column: NDArray[np.int16], rows: Map, nearest: float, farthest: float,
-                   out: Counts, doubt: NDArray[np.float64],
-                   believed: NDArray[np.bool_]) -> None:  # pragma: no cover - compiled
-    """Bin of the nearest thing in each column; −1 where there is none.
+def nearest_things(flat: Map, column: Columns, cosines: Map, nearest: float, farthest: float,
+                   columns: int) -> tuple[Counts, NDArray[np.float64], NDArray[np.bool_]]:
+    """Where the nearest thing is in each column of azimuth.
 
     Parameters
     ----------
-    flat, column : as `survey` fills them; `flat` is used up
-    rows : (H, 2) cosine of the latitude first
-    out : (C,) filled
-    doubt : (C,) filled: m² of pixels that are too few to be believed, six at least for _AREA
-    believed : (H, 2H) filled: pixels of things
+    flat, column : (H, 2H) as `survey` fills them; `flat` is used up
+    cosines : (H,) of the latitudes
+    nearest, farthest : metres
+    columns : how many
+
+    Returns
+    -------
+    (C,) bin of the nearest thing, −1 where there is none; (C,) m² of pixels that are too few to
+    be believed; (H, 2H) the pixels of things.
 
     """
+    bins = 2 + int(math.log(farthest / nearest) / _STEP)
+    found, doubt = np.full(columns, -1, np.int32), np.zeros(columns)
+    believed = np.zeros(flat.shape, np.bool_)
+    _scan(flat, column, cosines, nearest, np.zeros((columns, bins), np.int32), found, doubt,
+          believed)
+    return found, doubt, believed
+
+
+@kernel
+def _scan(flat: Map, column: Columns, cosines: Map, nearest: float, counts: Counts, found: Counts,
+          doubt: NDArray[np.float64],
+          believed: NDArray[np.bool_]) -> None:  # pragma: no cover - compiled
     height, width = flat.shape
     pixel = math.pi / height
-    bins = 2 + int(math.log(farthest / nearest) / _STEP)
-    counts = np.zeros((out.size, bins), np.int32)
-    lowest, highest = np.full(out.size, bins, np.int32), np.full(out.size, -1, np.int32)
-    total = np.zeros(out.size, np.int32)
-    stack = np.empty(flat.size, np.int32)
-    away = np.empty(flat.size, np.float32)
-    out[:] = -1
-    doubt[:] = 0
-    believed[:] = False
-    for start in range(flat.size):
-        if flat[start // width, start % width] <= 0:
-            continue
-        # Flood from here: what is taken is set to 0 in `flat`, and kept in `stack` and `away`.
-        size, next_one, area = 1, 0, 0.0
-        stack[0], away[0] = start, flat[start // width, start % width]
-        flat[start // width, start % width] = 0
-        while next_one < size:
-            i, j, d = stack[next_one] // width, stack[next_one] % width, away[next_one]
-            next_one += 1
-            area += rows[i, 0] * d * d
-            for y in range(max(i - 1, 0), min(i + 2, height)):
-                for k in range(j - 1, j + 2):
-                    x = k if 0 <= k < width else (k + width) % width
-                    other = flat[y, x]
-                    if other > 0 and other < _ALIKE * d and d < _ALIKE * other:
-                        stack[size], away[size] = y * width + x, other
-                        flat[y, x] = 0
-                        size += 1
-        if size < _PIXELS or area * pixel * pixel < _AREA:
+    places, away = np.empty(flat.size, np.int32), np.empty(flat.size, np.float32)
+    for i in range(height):
+        for j in range(width):
+            if flat[i, j] <= 0:
+                continue
+            size = _flood(flat, i, j, places, away)
+            area = 0.0
             for k in range(size):
-                i, j = stack[k] // width, stack[k] % width
-                doubt[column[i, j]] += min(rows[i, 0] * (away[k] * pixel)**2, _AREA / _PIXELS)
+                area += cosines[places[k] // width] * (away[k] * pixel)**2
+            if size >= _PIXELS and area >= _AREA:
+                _tell(places[:size], away[:size], column, pixel, nearest, counts, found, believed)
+                continue
+            for k in range(size):
+                y, x = places[k] // width, places[k] % width
+                doubt[column[y, x]] += min(cosines[y] * (away[k] * pixel)**2, _AREA / _PIXELS)
+
+
+@kernel
+def _flood(flat: Map, i: int, j: int, places: Counts,
+           away: Map) -> int:  # pragma: no cover - compiled
+    """Take the thing at (i, j) out of `flat`: its pixels and distances, and how many there are."""
+    height, width = flat.shape
+    places[0], away[0] = i * width + j, flat[i, j]
+    flat[i, j] = 0
+    size, done = 1, 0
+    while done < size:
+        i, j, d = places[done] // width, places[done] % width, away[done]
+        done += 1
+        for y in range(max(i - 1, 0), min(i + 2, height)):
+            for k in range(j - 1, j + 2):
+                x = k if 0 <= k < width else (k + width) % width
+                other = flat[y, x]
+                if other > 0 and other < _ALIKE * d and d < _ALIKE * other:
+                    places[size], away[size] = y * width + x, other
+                    flat[y, x] = 0
+                    size += 1
+    return size
+
+
+@kernel
+def _tell(places: Counts, away: Map, column: Columns, pixel: float, nearest: float,
+          counts: Counts, found: Counts,
+          believed: NDArray[np.bool_]) -> None:  # pragma: no cover - compiled
+    """Enter a thing: in each of its columns, where its near pixels are. `counts` stays zero."""
+    width, bins = column.shape[1], counts.shape[1]
+    first, last, lowest, highest = counts.shape[0], -1, bins, 0
+    for k in range(places.size):
+        y, x = places[k] // width, places[k] % width
+        believed[y, x] = True
+        at, place = column[y, x], 0
+        if away[k] >= nearest:
+            place = min(1 + int(math.log(away[k] / nearest) / _STEP), bins - 1)
+        counts[at, place] += 1
+        first, last = min(first, at), max(last, at)
+        lowest, highest = min(lowest, place), max(highest, place)
+    for at in range(first, last + 1):
+        total, run, place = 0, 0, lowest
+        for k in range(lowest, highest + 1):
+            total += counts[at, k]
+        if total == 0:
             continue
-        first, last = out.size, -1
-        for k in range(size):
-            i, j = stack[k] // width, stack[k] % width
-            believed[i, j] = True
-            at, place = column[i, j], 0
-            if away[k] >= nearest:
-                place = min(1 + int(math.log(away[k] / nearest) / _STEP), bins - 1)
-            counts[at, place] += 1
-            total[at] += 1
-            lowest[at], highest[at] = min(lowest[at], place), max(highest[at], place)
-            first, last = min(first, at), max(last, at)
-        for at in range(first, last + 1):
-            run, needed, found = 0, _QUANTILE * total[at], -1
-            for place in range(lowest[at], highest[at] + 1):
-                run += counts[at, place]
-                counts[at, place] = 0
-                if found < 0 and run > needed:
-                    found = place
-            seen = total[at] * pixel * pixel * math.exp(2 * found * _STEP) * nearest * nearest
-            if found >= 0 and total[at] >= _LEAST and seen > _IN_COLUMN and (out[at] < 0 or found < out[at]):
-                out[at] = found
-            lowest[at], highest[at], total[at] = bins, -1, 0
+        while run <= _QUANTILE * total:
+            run += counts[at, place]
+            place += 1
+        counts[at, lowest:highest + 1] = 0
+        distance = nearest * math.exp((place - 1) * _STEP)
+        enough = (total >= _PIXELS_IN_COLUMN
+                  and total * (pixel * distance)**2 >= _AREA_IN_COLUMN)
+        if enough and (found[at] < 0 or place - 1 < found[at]):
+            found[at] = place - 1

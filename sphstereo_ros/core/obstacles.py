@@ -104,10 +104,9 @@ class _Picture:
                self._camera.astype(np.float32), self._band(ground).array(),
                distances.astype(np.float32), cell, seen, flat, column)
         free = free_sectors(seen, distances, limits, ground, self._camera, cell)
-        nearest, doubt = np.empty(columns, np.int32), np.empty(columns)
-        believed = np.empty(flat.shape, np.bool_)
-        nearest_things(flat, column, self._angles[0], limits.minimum, limits.maximum, nearest,
-                       doubt, believed)
+        nearest, doubt, believed = nearest_things(
+            flat, column, np.ascontiguousarray(self._angles[0][:, 0]), limits.minimum,
+            limits.maximum, columns)
         free &= doubt.reshape(SECTORS, -1).sum(axis=1) < _DOUBT
         return self._result(_of_sectors(nearest), free, self._points(believed))
 
