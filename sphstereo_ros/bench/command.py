@@ -1,10 +1,10 @@
-"""The command `sphstereo bench accuracy|speed|live`."""
+"""The command `sphstereo bench accuracy|obstacles|speed|live`."""
 from __future__ import annotations
 
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +12,16 @@ from tqdm import tqdm
 
 from sphstereo_ros.replay.parameter_files import load_values
 from sphstereo_ros.replay.records import BadInput
-from sphstereo_ros.scenes.sequence import NUISANCES, REPORTED_SEEDS, SCENES
+from sphstereo_ros.scenes.sequence import NUISANCES, REPORTED_SEEDS, SCENES, TruthFrame
 
-from .methods import COMPARED, METHODS, PAIR_METHODS, method
+from .methods import COMPARED, METHODS, OBSTACLE_METHODS, PAIR_METHODS, method
 from .sequences import GROUND_TRUTH, Scenes, saved
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
-    kinds = parser.add_subparsers(dest='kind', required=True, metavar='accuracy|speed|live')
+    kinds = parser.add_subparsers(dest='kind', required=True,
+                                  metavar='accuracy|obstacles|speed|live')
     accuracy = kinds.add_parser('accuracy', help='pose and range against exact truth')
     _add_accuracy(accuracy)
     speed = kinds.add_parser('speed', help='the chain against one StereoBM call')
@@ -29,10 +30,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     speed.add_argument('--pairs', type=int, default=30, help='timed (default: %(default)s)')
     speed.add_argument('--params', type=Path, action='append', default=[], metavar='FILE')
     speed.add_argument('-p', action='append', default=[], dest='overrides', metavar='NAME:=VALUE')
+    obstacles = kinds.add_parser('obstacles', help='obstacle sectors against exact truth')
+    _add_obstacles(obstacles)
     live = kinds.add_parser('live', help='the nodes over DDS')
-    for one in (accuracy, speed):
+    for one in (accuracy, obstacles, speed):
         one.add_argument('--height', type=int, default=960, help='(default: %(default)s)')
-    for one in (accuracy, speed, live):
+    for one in (accuracy, obstacles, speed, live):
         one.add_argument('--json', action='store_true', help='end with one line of JSON')
     from . import live as live_bench
     live_bench.add_arguments(live)
@@ -64,6 +67,26 @@ def _add_accuracy(parser: argparse.ArgumentParser) -> None:
                         metavar='NAME:=VALUE', help='the same, one by one')
 
 
+def _add_obstacles(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('inputs', type=Path, nargs='*', metavar='FOLDER|BAG',
+                        help='frames with truth, as `sphstereo scene` writes them, or a bag with '
+                        '/ground_truth/range (default: scenes are rendered, and the sample bag)')
+    parser.add_argument('--scenes', nargs='+', choices=SCENES, default=SCENES, metavar='SCENE',
+                        help=f'of {", ".join(SCENES)}, to be rendered (default: all)')
+    parser.add_argument('--seeds', type=int, nargs='+', default=REPORTED_SEEDS, metavar='SEED',
+                        help='of the scenes to be rendered (default: %(default)s)')
+    parser.add_argument('--frames', type=int, default=14, help='of each (default: %(default)s)')
+    parser.add_argument('--cache', type=Path, metavar='DIR', help='keep what is rendered here, '
+                        'and take it from here the next time')
+    parser.add_argument('--ground', type=float, default=0.0, metavar='Z', help="height of the "
+                        "ground in the sequences' world, metres (default: %(default)s)")
+    parser.add_argument('--methods', help=f'of {",".join(OBSTACLE_METHODS)} (default: all)')
+    parser.add_argument('--params', type=Path, action='append', default=[], metavar='FILE',
+                        help='parameters of the method `default`')
+    parser.add_argument('-p', action='append', default=[], dest='overrides',
+                        metavar='NAME:=VALUE', help='the same, one by one')
+
+
 def main(args: argparse.Namespace) -> int:
     """Run one benchmark; returns the exit status."""
     if args.kind == 'live':
@@ -71,6 +94,8 @@ def main(args: argparse.Namespace) -> int:
         return int(live.main(args))
     if args.kind == 'accuracy':
         result = _binocular(args) if args.binocular else _accuracy(args)
+    elif args.kind == 'obstacles':
+        result = _obstacles(args)
     else:
         result = _speed(args)
     if args.json:
@@ -130,6 +155,34 @@ def _binocular(args: argparse.Namespace) -> dict[str, Any]:
     summaries = contest.summaries()
     print(table(summaries))
     return summaries
+
+
+def _obstacles(args: argparse.Namespace) -> dict[str, Any]:
+    from .obstacles import ObstacleContest, table
+    names = _chosen(args.methods, OBSTACLE_METHODS, OBSTACLE_METHODS)
+    given = load_values(args.params, args.overrides)
+    contest = ObstacleContest({name: method(name, given) for name in names}, args.ground)
+    with tqdm(unit='frame', disable=None) as progress:
+        for name, sequence in _obstacle_inputs(args):
+            contest.add(name, sequence, progress.update)
+    summaries = contest.summaries()
+    print(table(summaries))
+    return summaries
+
+
+def _obstacle_inputs(args: argparse.Namespace) -> Iterator[tuple[str, Iterable[TruthFrame]]]:
+    """Names and frames of what was asked for."""
+    from .obstacles import frames_of_bag
+    from .processes import shipped
+    bags = [path for path in args.inputs if path.is_file()]
+    for path in bags if args.inputs else [shipped('bags/street.mcap')]:
+        yield path.name, frames_of_bag(path)
+    folders = [path for path in args.inputs if path not in bags]
+    for path, sequence in zip(folders, saved(folders), strict=True):
+        yield path.name, sequence
+    for name in () if args.inputs else args.scenes:
+        scenes = Scenes(name, args.seeds, args.frames, args.height, None, args.cache)
+        yield from ((name, sequence) for sequence in scenes.sequences())
 
 
 def _plotter() -> Callable[[dict[str, Any], Path], list[Path]]:

@@ -35,6 +35,8 @@ def _file(name: str) -> Mapping[str, object]:
 COMPARED = ('paper', 'sgbm_true_pose', 'one_reference', 'default', 'live',
             'live_checked')
 METHODS = (*COMPARED, *MATCHERS)
+# What obstacles are looked for with.
+OBSTACLE_METHODS = ('default', 'live', 'live_checked')
 # With two cameras.
 PAIR_METHODS = ('default', 'bm', 'sgbm', 'flow', 'hybrid', 'live')
 

@@ -108,6 +108,11 @@ class Score:
         """Count a frame without a result."""
         self.counts[f'drops.{cause}'] += 1
 
+    def include(self, other: Score) -> None:
+        """Add all that `other` has taken."""
+        self.counts.update(other.counts)
+        self.errors += other.errors
+
     def summary(self) -> Mapping[str, Any]:
         """Shares in percent; `near_…` are counts of sectors with something nearer than 10 m."""
         c, total = self.counts, max(self.counts['sectors'], 1)

@@ -14,10 +14,10 @@ Columns = NDArray[np.int16]
 
 _ALIKE = 1.1  # ratio of the distances of neighbours that belong together
 # The smallest thing that is believed: m² that face the camera, and pixels; and what of it a
-# column must show.
+# column must show: so many m², or pixels of its whole width up to such a height (m).
 _AREA, _PIXELS = 0.015, 6
-_AREA_IN_COLUMN, _PIXELS_IN_COLUMN = 0.003, 3
-_QUANTILE = 0.15  # of a thing's pixels in a column are nearer than what is told
+_AREA_IN_COLUMN, _HEIGHT_IN_COLUMN, _PIXELS_IN_COLUMN = 0.003, 0.1, 3
+_QUANTILE = 0.1  # of a thing's pixels in a column are nearer than what is told
 _STEP = 0.005  # relative width of the bins of distance
 
 
@@ -123,7 +123,8 @@ def _tell(places: Counts, away: Map, column: Columns, pixel: float, nearest: flo
             place += 1
         counts[at, lowest:highest + 1] = 0
         distance = nearest * math.exp((place - 1) * _STEP)
+        strip = distance * 2 * math.pi / counts.shape[0] * _HEIGHT_IN_COLUMN
         enough = (total >= _PIXELS_IN_COLUMN
-                  and total * (pixel * distance)**2 >= _AREA_IN_COLUMN)
+                  and total * (pixel * distance)**2 >= min(_AREA_IN_COLUMN, strip))
         if enough and (found[at] < 0 or place - 1 < found[at]):
             found[at] = place - 1

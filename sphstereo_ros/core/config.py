@@ -265,6 +265,10 @@ class ObstaclesConfig:
                                  'ground is no obstacle', unit='m', low=0.0, high=2.0)
     vehicle_width: float = _p('obstacles.vehicle_width', 0.6, 'of the way that must be free, for '
                               'the time to contact', unit='m', low=0.0, high=100.0)
+    hidden_width: float = _p('obstacles.hidden_width', 1.0, 'a sector is unknown where something '
+                             'so wide could stand unseen, much nearer than what is measured; 0 = '
+                             'it is told as measured, all the same', unit='m', low=0.0,
+                             high=100.0)
     trust_sky: bool = _p('obstacles.trust_sky', False, 'more than 11° above the horizon, a sector '
                          'may be free where nothing is measured: plain sky has no range, but '
                          'neither has a branch before it that was missed')

@@ -8,7 +8,8 @@ stand unseen (`open_space`).
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from dataclasses import replace
+from functools import lru_cache, partial
 
 import cv2
 import numpy as np
@@ -20,7 +21,7 @@ from .contact import time_to_contact
 from .frames import Drop, FrameKey, Image8, RangeImage
 from .ground import Ground, find_ground, surfaces_below
 from .level import Attitude
-from .open_space import STEEPEST, distances_asked, free_sectors
+from .open_space import STEEPEST, Hidden, distances_asked, hiding_place
 from .rotations import mount
 from .sectors import SECTORS, ObstacleSectors, SectorState
 from .survey import Band, survey
@@ -28,6 +29,11 @@ from .warp import Map
 
 Floats = NDArray[np.float64]
 
+# A sector is free where no pole could stand unseen. It is measured where nothing could that is as
+# wide as `obstacles.hidden_width`, at less than _BEFORE of the distance that is measured.
+_POLE = Hidden(0.15, 0.5, 10.0, 0.75, False)
+_BODY = Hidden(1.0, 0.4, 10.0, 0.15, True)
+_BEFORE = 0.6
 _DOUBT = 0.01  # m²: a sector with so much that is too small to be believed is not free
 _COLUMNS, _PIXELS_PER_COLUMN = 10, 1.3  # of a sector, at most, and where the image has as many
 _CELL = math.radians(1.0)  # height of the cells of `open_space`, at least
@@ -103,12 +109,17 @@ class _Picture:
         survey(image.range, image.sigma, *self._angles, self._turn,
                self._camera.astype(np.float32), self._band(ground).array(),
                distances.astype(np.float32), cell, seen, flat, column)
-        free = free_sectors(seen, distances, limits, ground, self._camera, cell)
+        place = partial(hiding_place, seen, distances, limits=limits, ground=ground,
+                        camera=self._camera, cell=cell)
+        free = np.isinf(place(replace(_POLE, trust_sky=limits.trust_sky)))
+        hidden = np.full(SECTORS, np.inf)
+        if limits.hidden_width > 0:
+            hidden = place(replace(_BODY, width=limits.hidden_width))
         nearest, doubt, believed = nearest_things(
             flat, column, np.ascontiguousarray(self._angles[0][:, 0]), limits.minimum,
             limits.maximum, columns)
         free &= doubt.reshape(SECTORS, -1).sum(axis=1) < _DOUBT
-        return self._result(_of_sectors(nearest), free, self._points(believed))
+        return self._result(_of_sectors(nearest), free, hidden, self._points(believed))
 
     def _points(self, believed: NDArray[np.bool_]) -> Map:
         step = max(1, len(believed) // (2 * _SAMPLED_ROWS))
@@ -122,18 +133,18 @@ class _Picture:
                           + self._camera.astype(np.float32), np.float32)
 
     def _result(self, found: NDArray[np.int32], free: NDArray[np.bool_],
-                points: Map) -> ObstacleSectors:
+                hidden: Floats, points: Map) -> ObstacleSectors:
         limits = self._config.obstacles
-        measured = found >= 0
         middle = bin_middle(found, limits.minimum)
+        measured = (found >= 0) & (hidden > _BEFORE * middle)
         distance = np.where(measured, np.clip(middle, limits.minimum, limits.maximum),
                             np.nan).astype(np.float32)
         state = np.where(measured, SectorState.MEASURED,
                          np.where(free, SectorState.FREE, SectorState.UNKNOWN)).astype(np.uint8)
         nearest = float(distance[measured].min()) if measured.any() else None
         contact = time_to_contact(state, distance, self._attitude.velocity, limits.vehicle_width)
-        return ObstacleSectors(self._image.key, state, distance, found == 0, limits.minimum,
-                               limits.maximum, points, nearest, contact)
+        return ObstacleSectors(self._image.key, state, distance, measured & (found == 0),
+                               limits.minimum, limits.maximum, points, nearest, contact)
 
     def _ground(self) -> Ground | None:
         step = max(1, len(self._image.range) // _SAMPLED_ROWS)
@@ -145,7 +156,7 @@ class _Picture:
     def _band(self, ground: Ground | None) -> Band:
         limits, measured = self._config.obstacles, self._config.range
         plane = (0.0, 0.0, -math.inf) if ground is None else (*ground.slope, ground.height)
-        return Band(limits.height_below, limits.height_above, limits.maximum,
+        return Band(limits.height_below, limits.height_above, limits.minimum, limits.maximum,
                     limits.ground_clearance, measured.minimum, measured.maximum, plane)
 
 

@@ -6,6 +6,7 @@ measured as farther, or it could hide there.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +20,6 @@ Counts = NDArray[np.int32]
 Floats = NDArray[np.float64]
 
 STEEPEST = math.radians(60)  # elevations beyond are not looked at
-# What could hide, up to 10 m; farther off, something of that angular size.
-_WIDTH, _HEIGHT, _FAR = 0.15, 0.5, 10.0
-_CLEAR = 0.75  # of its pixels must be measured as farther
 _STEPS, _RATIO, _NEAREST = 8, 1.5, 0.5  # distances at which that is asked
 # Sky: from that elevation on; columns beside that are looked at; share of stray pixels.
 _SKY, _BESIDE, _STRAY = math.radians(11), 2, 0.02
@@ -34,9 +32,23 @@ def distances_asked(maximum: float) -> Floats:
     return np.asarray(steps[steps >= min(_NEAREST, maximum)])
 
 
-def free_sectors(seen: Counts, distances: Floats, limits: ObstaclesConfig,
-                 ground: Ground | None, camera: Floats, cell: float) -> NDArray[np.bool_]:
-    """Sectors (72,) in which nothing could hide within the last of `distances`.
+@dataclass(frozen=True)
+class Hidden:
+    """What is asked to be hidden: metres wide and high (beyond `far`, of the size it has there in
+    the picture), the share of its pixels that must be farther to say no, and whether what may be
+    sky counts as farther.
+    """
+
+    width: float
+    height: float
+    far: float
+    clear: float
+    trust_sky: bool
+
+
+def hiding_place(seen: Counts, distances: Floats, thing: Hidden, limits: ObstaclesConfig,
+                 ground: Ground | None, camera: Floats, cell: float) -> Floats:
+    """The least of `distances` at which `thing` could hide in each sector (72,); inf: at none.
 
     Parameters
     ----------
@@ -48,8 +60,9 @@ def free_sectors(seen: Counts, distances: Floats, limits: ObstaclesConfig,
     """
     plane = (0.0, 0.0, -math.inf) if ground is None else (*ground.slope, ground.height)
     bounds = np.array([-limits.height_below, limits.height_above, limits.ground_clearance])
-    return np.asarray(_free(seen, distances, bounds, np.array(plane), camera, cell,
-                            limits.trust_sky))
+    asked = np.array([thing.width, thing.height, thing.far, thing.clear])
+    return np.append(distances, np.inf)[_hiding(seen, distances, asked, bounds, np.array(plane),
+                                                camera, cell, thing.trust_sky)]
 
 
 @kernel
@@ -71,14 +84,14 @@ def _within(sums: NDArray[np.int64], e0: int, e1: int, c0: int,
 
 @kernel
 def _hides(sums: NDArray[np.int64], clear: NDArray[np.int64], angle: float, distance: float,
-           size: Floats, low: float, high: float, up: float,
+           size: Floats, share: float, low: float, high: float, up: float,
            cell: float) -> bool:  # pragma: no cover - compiled
     """Whether a thing of `size` could hide in front, between two heights.
 
     angle : of its middle, in columns; distance : from the camera; up : height of the camera
     """
     rows, columns = sums.shape[0] - 1, sums.shape[1] // 2
-    wide = max(1, round(size[0] / distance * columns / (2 * np.pi)))
+    wide = min(max(1, round(size[0] / distance * columns / (2 * np.pi))), columns)
     c0 = math.floor(angle - 0.5 * wide + 0.5) % columns
     tall = min(size[1], high - low)
     steps = max(1, math.ceil(2 * (high - low - tall) / tall - 1e-9) + 1)
@@ -90,7 +103,7 @@ def _hides(sums: NDArray[np.int64], clear: NDArray[np.int64], angle: float, dist
         if e1 <= e0:
             continue
         total = _within(sums, e0, e1, c0, c0 + wide)
-        if total <= 0 or _within(clear, e0, e1, c0, c0 + wide) < _CLEAR * total:
+        if total <= 0 or _within(clear, e0, e1, c0, c0 + wide) < share * total:
             return True
     return False
 
@@ -122,8 +135,9 @@ def _with_sky(farther: Counts, known: Counts, unknown: Counts,
 
 
 @kernel
-def _free(seen: Counts, distances: Floats, bounds: Floats, plane: Floats, camera: Floats,
-          cell: float, trust_sky: bool) -> NDArray[np.bool_]:  # pragma: no cover - compiled
+def _hiding(seen: Counts, distances: Floats, asked: Floats, bounds: Floats, plane: Floats,
+            camera: Floats, cell: float,
+            trust_sky: bool) -> NDArray[np.intp]:  # pragma: no cover - compiled
     layers, rows, columns = seen.shape
     horizon = int((STEEPEST + _SKY) / cell) + 1
     sums = np.zeros((rows + 1, 2 * columns + 1), np.int64)
@@ -133,17 +147,15 @@ def _free(seen: Counts, distances: Floats, bounds: Floats, plane: Floats, camera
         farther += seen[layer]
     known[:] = farther
     _sums(known + seen[layers - 1], sums)
-    out = np.ones(SECTORS, np.bool_)
-    size = np.empty(2)
+    out = np.full(SECTORS, layers - 2)
     for k in range(layers - 2):
         farther -= seen[k]  # what is left is farther than distances[k]
         _sums(_with_sky(farther, known, seen[layers - 1], horizon) if trust_sky else farther,
               clear)
-        size[0] = _WIDTH * max(1.0, distances[k] / _FAR)
-        size[1] = _HEIGHT * max(1.0, distances[k] / _FAR)
+        size = asked[:2] * max(1.0, distances[k] / asked[2])
         for column in range(columns):
             sector = column * SECTORS // columns
-            if not out[sector]:
+            if out[sector] < layers - 2:
                 continue
             azimuth = FIRST_SECTOR - 0.5 * SECTOR_WIDTH + (column + 0.5) * 2 * np.pi / columns
             x, y = distances[k] * math.cos(azimuth), -distances[k] * math.sin(azimuth)
@@ -152,7 +164,7 @@ def _free(seen: Counts, distances: Floats, bounds: Floats, plane: Floats, camera
                 continue
             x, y = x - camera[0], y - camera[1]
             turned = math.atan2(-y, x) - FIRST_SECTOR + 0.5 * SECTOR_WIDTH
-            if _hides(sums, clear, turned * columns / (2 * np.pi), math.hypot(x, y), size, low,
-                      bounds[1], camera[2], cell):
-                out[sector] = False
+            if _hides(sums, clear, turned * columns / (2 * np.pi), max(math.hypot(x, y), 0.05),
+                      size, asked[3], low, bounds[1], camera[2], cell):
+                out[sector] = k
     return out

@@ -29,6 +29,7 @@ class Band:
 
     below: float
     above: float
+    nearest: float
     farthest: float
     clearance: float
     range_min: float
@@ -37,8 +38,8 @@ class Band:
 
     def array(self) -> Map:
         """For the kernel."""
-        return np.array([-self.below, self.above, self.farthest, self.clearance, self.range_min,
-                         self.range_max, *self.plane], np.float32)
+        return np.array([-self.below, self.above, self.nearest, self.farthest, self.clearance,
+                         self.range_min, self.range_max, *self.plane], np.float32)
 
 
 @kernel
@@ -59,8 +60,8 @@ def survey(r: Map, sigma: Map, rows: Map, columns: Map, turn: Map, camera: Map, 
     column : (H, 2H) filled where `flat` is not 0: azimuth, of as many as `seen` has columns
 
     """
-    low, high, farthest, clearance = band[0], band[1], band[2], band[3]
-    range_min, range_max, slope_x, slope_y, floor = band[4], band[5], band[6], band[7], band[8]
+    low, high, nearest, farthest, clearance = band[0], band[1], band[2], band[3], band[4]
+    range_min, range_max, slope_x, slope_y, floor = band[5], band[6], band[7], band[8], band[9]
     width = seen.shape[2]
     per_radian = np.float32(width / (2 * math.pi))
     shift = np.float32(SECTOR_WIDTH / 2 - FIRST_SECTOR + 2 * math.pi)
@@ -108,5 +109,7 @@ def survey(r: Map, sigma: Map, rows: Map, columns: Map, turn: Map, camera: Map, 
             if pz < ground + clearance + slack and (
                     ground < np.float32(_RISE) + np.float32(_RISE_RATE) * away):
                 continue
+            if r[i, j] < 0:  # nearer than `range.min`, wherever
+                away = min(away, np.float32(0.999) * nearest)
             flat[i, j] = max(away, np.float32(1e-3))
             column[i, j] = int((shift - _arctan2(py, px)) * per_radian) % width
