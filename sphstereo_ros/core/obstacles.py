@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 # A sector is free where no pole could stand unseen. It is measured where nothing could that is as
 # wide as `obstacles.hidden_width`, at less than _BEFORE of the distance that is measured.
 _POLE = Hidden(0.15, 0.5, 10.0, 0.75, False)
-_BODY = Hidden(1.0, 0.4, 10.0, 0.15, True)
+_BODY = Hidden(1.0, 0.4, 10.0, 0.15, True, nearest=2.0)
 _BEFORE = 0.6
 _DOUBT = 0.01  # m²: a sector with so much that is too small to be believed is not free
 _COLUMNS, _PIXELS_PER_COLUMN = 10, 1.3  # of a sector, at most, and where the image has as many

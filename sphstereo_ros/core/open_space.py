@@ -35,8 +35,8 @@ def distances_asked(maximum: float) -> Floats:
 @dataclass(frozen=True)
 class Hidden:
     """What is asked to be hidden: metres wide and high (beyond `far`, of the size it has there in
-    the picture), the share of its pixels that must be farther to say no, and whether what may be
-    sky counts as farther.
+    the picture), the share of its pixels that must be farther to say no, whether what may be sky
+    counts as farther, and the nearest distance at which it is looked for.
     """
 
     width: float
@@ -44,6 +44,7 @@ class Hidden:
     far: float
     clear: float
     trust_sky: bool
+    nearest: float = 0.0
 
 
 def hiding_place(seen: Counts, distances: Floats, thing: Hidden, limits: ObstaclesConfig,
@@ -60,7 +61,7 @@ def hiding_place(seen: Counts, distances: Floats, thing: Hidden, limits: Obstacl
     """
     plane = (0.0, 0.0, -math.inf) if ground is None else (*ground.slope, ground.height)
     bounds = np.array([-limits.height_below, limits.height_above, limits.ground_clearance])
-    asked = np.array([thing.width, thing.height, thing.far, thing.clear])
+    asked = np.array([thing.width, thing.height, thing.far, thing.clear, thing.nearest])
     return np.append(distances, np.inf)[_hiding(seen, distances, asked, bounds, np.array(plane),
                                                 camera, cell, thing.trust_sky)]
 
@@ -150,6 +151,8 @@ def _hiding(seen: Counts, distances: Floats, asked: Floats, bounds: Floats, plan
     out = np.full(SECTORS, layers - 2)
     for k in range(layers - 2):
         farther -= seen[k]  # what is left is farther than distances[k]
+        if distances[k] < asked[4]:
+            continue
         _sums(_with_sky(farther, known, seen[layers - 1], horizon) if trust_sky else farther,
               clear)
         size = asked[:2] * max(1.0, distances[k] / asked[2])
