@@ -18,8 +18,8 @@ Plane = NDArray[np.float32]
 
 # A polar grid in which every cell counts alike: rings in steps of equal ratio.
 _RINGS, _WEDGES, _NEAREST, _FARTHEST = 16, 24, 0.3, 25.0
-_PER_CELL = 4  # points of a cell that take part
-_SAMPLES = 160
+_PER_CELL = 3  # points of a cell that take part
+_SAMPLES = 96
 _ROUGH, _ROUGH_RATE = 0.08, 0.01  # m, and m per m of distance: how far ground is off its plane
 _STEEPEST = math.tan(math.radians(20))
 _LEAST_CELLS, _LEAST_SHARE = 12, 0.2  # of the cells that have points
