@@ -255,11 +255,12 @@ def test_turning_the_world_turns_the_sectors(turn: int, seed: int) -> None:
     posts = [(r, a, w) for r, a, w in zip(rng.uniform(1, 15, 6), rng.uniform(0, 2 * np.pi, 6),
                                           rng.uniform(0.1, 0.4, 6), strict=True)]
 
-    def world(by: float) -> ObstacleSectors:
-        return detect(seen(floor(0.9), *(post(r * np.cos(a - by), r * np.sin(a - by), w)
-                                         for r, a, w in posts), height=144))
-
-    here, turned = world(0.0), world(np.radians(5.0 * turn))
+    image = seen(floor(0.9), *(post(r * np.cos(a), r * np.sin(a), w) for r, a, w in posts),
+                 height=144)
+    by = turn * 2 * 144 // SECTORS  # pixels, to the right
+    here = detect(image)
+    turned = detect(dataclasses.replace(image, range=np.roll(image.range, by, axis=1),
+                                        sigma=np.roll(image.sigma, by, axis=1)))
     assert turned.state.tolist() == np.roll(here.state, turn).tolist()
     np.testing.assert_allclose(turned.distance, np.roll(here.distance, turn), rtol=0.012)
 

@@ -23,6 +23,7 @@ STEEPEST = math.radians(60)  # elevations beyond are not looked at
 _STEPS, _RATIO, _NEAREST = 8, 1.5, 0.5  # distances at which that is asked
 # Sky: from that elevation on; columns beside that are looked at; share of stray pixels.
 _SKY, _BESIDE, _STRAY = math.radians(11), 2, 0.02
+_ROUNDING = 1e-6  # of a column: what lies between two goes to one side, wherever it is
 _LEAST_ROOM = 0.05  # m between ground and the top of the band
 
 
@@ -93,7 +94,7 @@ def _hides(sums: NDArray[np.int64], clear: NDArray[np.int64], angle: float, dist
     """
     rows, columns = sums.shape[0] - 1, sums.shape[1] // 2
     wide = min(max(1, round(size[0] / distance * columns / (2 * np.pi))), columns)
-    c0 = math.floor(angle - 0.5 * wide + 0.5) % columns
+    c0 = math.floor(angle - 0.5 * wide + 0.5 + _ROUNDING) % columns
     tall = min(size[1], high - low)
     steps = max(1, math.ceil(2 * (high - low - tall) / tall - 1e-9) + 1)
     for k in range(steps):
