@@ -31,7 +31,7 @@ $(READY): setup.py setup.cfg requirements/constraints.txt
 	@echo '== environment: $(VENV) ($(PYTHON)), about a minute, only this once'
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --progress-bar off -c requirements/constraints.txt \
-		-e '.[ros,scenes,plots,test,dev]'
+		-e '.[ros,scenes,plots,report,test,dev]'
 	@touch $@
 
 demo: $(READY)

@@ -11,7 +11,7 @@ setup(
     name=NAME,
     version='0.1.0',
     packages=find_packages(exclude=['test', 'test.*']),
-    package_data={NAME: ['ros/*.xml', 'py.typed']},
+    package_data={NAME: ['ros/*.xml', 'report/web/*', 'py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -25,6 +25,7 @@ setup(
         'ros': ['ros-jazzy-rclpy', 'ros-jazzy-common-interfaces', 'ros-jazzy-rmw-fastrtps-cpp'],
         'scenes': ['trimesh', 'embreex', 'scipy'],
         'plots': ['matplotlib'],
+        'report': ['jinja2', 'matplotlib'],
         'mavlink': ['pymavlink', 'pyserial'],
         'test': ['pytest', 'hypothesis', 'mcap-ros2-support', 'pymavlink', 'pyserial'],
         'dev': ['ruff', 'mypy', 'types-PyYAML', 'pytest-cov'],
@@ -34,6 +35,7 @@ setup(
     maintainer_email='maintainers@example.com',
     description='Depth in every direction from one 360-degree camera, as ROS 2 nodes',
     license='Apache-2.0',
+    license_files=['LICENSE', 'NOTICE'],
     entry_points={
         'console_scripts': ['sphstereo = sphstereo_ros.cli:main']
         + [f'{node} = {NAME}.cli.nodes:{node}' for node in NODES],

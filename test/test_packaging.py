@@ -88,8 +88,10 @@ def test_shipped_files_are_installed(setup: dict[str, Any]) -> None:
     assert not any(p.startswith('test') for p in setup['packages'])
     profiles = list((ROOT / 'sphstereo_ros/ros').glob('*.xml'))
     assert profiles
-    assert {f'ros/{p.name}' for p in profiles} <= {
-        f'ros/{match.name}' for pattern in setup['package_data']['sphstereo_ros']
+    web = [file for file in (ROOT / 'sphstereo_ros/report/web').iterdir() if file.is_file()]
+    assert 'three.min.js' in {file.name for file in web}
+    assert {*profiles, *web} <= {
+        match for pattern in setup['package_data']['sphstereo_ros']
         for match in (ROOT / 'sphstereo_ros').glob(pattern)}
 
 

@@ -20,6 +20,8 @@ COMMANDS = {
     'run': ('sphstereo_ros.cli.run', 'depth and clouds from a bag, a video or frames, offline'),
     'replay': ('sphstereo_ros.cli.replay', 'publish the inputs in a bag live, with /clock'),
     'import': ('sphstereo_ros.cli.import_video', 'any 360° video into a bag'),
+    'report': ('sphstereo_ros.cli.report', 'a page on a file of results: depth, cloud, errors, '
+                                         'timings'),
     'mask': ('sphstereo_ros.cli.mask', "the vehicle's mask (camera.mask) from a recording"),
     'calibrate': ('sphstereo_ros.cli.calibrate',
                   'the alignment of two cameras, one above the other'),
