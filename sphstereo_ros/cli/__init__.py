@@ -22,6 +22,7 @@ COMMANDS = {
     'import': ('sphstereo_ros.cli.import_video', 'any 360° video into a bag'),
     'report': ('sphstereo_ros.cli.report', 'a page on a file of results: depth, cloud, errors, '
                                          'timings'),
+    'view': ('sphstereo_ros.cli.view', 'a bag or the running topics in a viewer'),
     'mask': ('sphstereo_ros.cli.mask', "the vehicle's mask (camera.mask) from a recording"),
     'calibrate': ('sphstereo_ros.cli.calibrate',
                   'the alignment of two cameras, one above the other'),

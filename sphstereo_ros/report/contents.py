@@ -123,22 +123,14 @@ class Contents:
         return DEPTH in self.topics or RELATIVE not in self.topics
 
 
-def namespace_of(source: Source) -> str:
-    """What comes before the names of the results, as in '/robot'.
-
-    Raises
-    ------
-    BadInput
-        where there are no results
-
-    """
+def namespace_of(source: Source) -> str | None:
+    """What comes before the names of the results, as in '/robot'; None without results."""
     held = [topic for topic in source.topics if source.count([topic])]
     for result in RESULTS:
         for topic in sorted(held, key=len):
             if topic.endswith(result) and source.topics[topic] == KINDS[result]:
                 return topic.removesuffix(result)
-    raise BadInput('holds no results (depth, clouds, obstacles or a map): '
-                   'sphstereo run makes them')
+    return None
 
 
 def spread(items: Sequence[int], most: int) -> list[int]:
@@ -153,10 +145,19 @@ class Reading:
     """Reads the bags of a report.
 
     results : the bag of results; inputs : more bags, with images, odometry and true ranges
+
+    Raises
+    ------
+    BadInput
+        where there are no results
+
     """
 
     def __init__(self, results: Source, inputs: Sequence[Source] = ()) -> None:
         namespace = namespace_of(results)
+        if namespace is None:
+            raise BadInput('holds no results (depth, clouds, obstacles or a map): '
+                           'sphstereo run makes them')
         # The first that has a topic is asked for it.
         self._parts = [(results, namespace), *((source, '') for source in inputs)]
         self._wanted: list[dict[str, str]] = []

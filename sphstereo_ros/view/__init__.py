@@ -1,0 +1,1 @@
+"""Inputs and results in a viewer, from a bag or as they are published."""
