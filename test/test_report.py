@@ -326,7 +326,9 @@ def test_live_recording_tells_latency_and_drops_over_a_restart(tmp_path):
     messages = sorted([*((t, k, m) for t, k, m in inputs() if t == '/image'),
                        *((t, k, m) for t, k, m in results() if t == '/depth/image')],
                       key=lambda each: each[1])
-    messages += [('/diagnostics', k, diagnostics(k, frames_in=k, rate_out=9.5, latency_p50_ms=40,
+    rates = {1: 0.0, 2: 9.5, 3: 9.0, 4: 0.0}
+    messages += [('/diagnostics', k, diagnostics(k, frames_in=k, rate_out=rates[k],
+                                                 latency_p50_ms=40 + k,
                                                  **{'drops.superseded': count}))
                  for k, count in counts.items()]
     bag = write(tmp_path / 'live.mcap', messages, late=30_000_000)
@@ -334,6 +336,8 @@ def test_live_recording_tells_latency_and_drops_over_a_restart(tmp_path):
     told = told_of(tmp_path / 'page')
     assert told['latency'] == {'p50': 30.0, 'p95': 30.0, 'frames': 4}
     assert told['drops'] == [{'stage': 'pipeline', 'cause': 'superseded', 'count': 7}]
+    stage, = told['stages']
+    assert (stage['rate_out'], stage['latency_p50_ms'], stage['frames_in']) == (9.25, 44, 4)
     assert (tmp_path / 'page' / 'latency.png').is_file()
     assert told['accuracy'] is None
     assert told['overview']['points'] is None

@@ -37,7 +37,8 @@ TRUTH = '/ground_truth/range'
 IMAGE, DEPTH, CLOUD, PREVIEW = '/image/compressed', '/depth/image', '/points', '/depth/preview'
 RECORDED = {IMAGE: 'sensor_msgs/msg/CompressedImage', DEPTH: 'sensor_msgs/msg/Image',
             CLOUD: 'sensor_msgs/msg/PointCloud2', PREVIEW: 'sensor_msgs/msg/Image',
-            '/odometry/visual': 'nav_msgs/msg/Odometry'}
+            '/odometry/visual': 'nav_msgs/msg/Odometry',
+            '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray'}
 SLOW = 0.2
 START_UP = 90.0  # seconds for nodes to be ready, and for the last results to arrive
 LAST_RESULT = 20.0
@@ -211,6 +212,19 @@ def write_results(done: Pass, folder: Path) -> None:
             write_ply(folder / 'cloud.ply', cloud)
 
 
+def write_page(results: Path, bag: Path, folder: Path) -> str:
+    """Make the page of `sphstereo report`; returns what is to be said of it."""
+    try:
+        from sphstereo_ros.report.contents import Reading
+        from sphstereo_ros.report.page import write_report
+    except ModuleNotFoundError as error:
+        return f'no report: there is no {error.name}'
+    contents = Reading(open_source(results), [open_source(bag)]).read()
+    page = write_report(contents, folder, f'{bag.name}, live',
+                        f'sphstereo report {results} --input {bag} -o {folder}')[0]
+    return f'open {page} in a browser'
+
+
 def beside(image: Image8 | None, preview: Image8 | None) -> Image8:
     """Two BGR pictures side by side, the first at the size of the second."""
     assert image is not None
@@ -272,7 +286,8 @@ def run(arguments: argparse.Namespace) -> int:
                'slow_frames_without_depth': len(missing)}
     (folder / 'summary.json').write_text(json.dumps(summary, indent=1) + '\n')
     (folder / 'summary.txt').write_text(table(summary) + '\n')
-    say(f'results are in {folder}/\n\n{table(summary)}')
+    said = write_page(folder / 'results.mcap', bag, folder / 'report')
+    say(f'results are in {folder}/; {said}\n\n{table(summary)}')
     if missing or len(slow.messages[DEPTH]) < len(images) - 1:
         print(f'\nFAILED: {len(missing)} frames beside the first have no depth', file=sys.stderr)
         return 1

@@ -19,7 +19,8 @@ from sphstereo_ros.report.contents import (
 from sphstereo_ros.report.tracks import track_error
 
 Row = dict[str, Any]
-_TIMES = ('rate_in', 'rate_out', 'latency_p50_ms', 'latency_p95_ms', 'memory_mb')
+_COUNTS, _RATES = ('frames_in', 'frames_out'), ('rate_in', 'rate_out')
+_LAST = ('latency_p50_ms', 'latency_p95_ms', 'memory_mb')
 
 
 def summarise(contents: Contents) -> dict[str, Any]:
@@ -65,20 +66,26 @@ def _pace(seen: TopicSeen) -> Row:
     return {'rate': float(len(gaps) / gaps.sum()), 'gap': float(gaps.max())}
 
 
-def _last_values(diagnostics: Sequence[Any]) -> dict[str, dict[str, str]]:
-    found: dict[str, dict[str, str]] = {}
+def stages(diagnostics: Sequence[Any]) -> list[Row]:
+    """What each stage told: rates while something came (median), the rest at the end."""
+    rates: dict[str, dict[str, list[float]]] = {}
+    last: dict[str, dict[str, str]] = {}
     for message in diagnostics:
         for status in message.status:
-            found[str(status.name)] = {v.key: v.value for v in status.values}
-    return found
+            name, values = str(status.name), {v.key: v.value for v in status.values}
+            last[name] = values
+            for key in _RATES:
+                rate = _number(values.get(key))
+                if rate:
+                    rates.setdefault(name, {}).setdefault(key, []).append(rate)
+    return [{'stage': name,
+             **{key: _number(values.get(key)) for key in (*_COUNTS, *_LAST)},
+             **{key: _median(rates.get(name, {}).get(key, [])) for key in _RATES}}
+            for name, values in last.items() if 'frames_in' in values or 'rate_in' in values]
 
 
-def stages(diagnostics: Sequence[Any]) -> list[Row]:
-    """What the last report of each stage told of rates, latency and memory."""
-    return [{'stage': name, **{key: _number(values.get(key)) for key in
-                               ('frames_in', 'frames_out', *_TIMES)}}
-            for name, values in _last_values(diagnostics).items()
-            if 'frames_in' in values or 'rate_in' in values]
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if values else None
 
 
 def _number(value: str | None) -> float | None:
