@@ -368,6 +368,18 @@ def test_namespace_and_map_of_other_fields(tmp_path):
     assert np.isnan(read.sigma).all()
 
 
+def test_a_map_is_in_the_frame_of_its_own_track(tmp_path):
+    def tracks_of(name, *topics):
+        bag = write(tmp_path / f'{name}.mcap', [(topic, k, odometry(k)) for k in range(3)
+                                                for topic in ('/odometry', '/map/odometry')]
+                    + list(topics))
+        assert run('report', bag, '-o', tmp_path / name) == 0
+        return [track['track'] for track in told_of(tmp_path / name)['tracks']]
+    points = convert.cloud_message(make, cloud(1))
+    assert tracks_of('one', ('/map', 1, points)) == ['/map/odometry', '/odometry']
+    assert tracks_of('two', ('/points', 1, points)) == ['/odometry', '/map/odometry']
+
+
 def test_relative_depth_alone(tmp_path, capsys):
     bag = write(tmp_path / 'relative.mcap', [
         ('/depth/relative', k, convert.depth_message(make, key(k), measured(k)))

@@ -255,12 +255,21 @@ class Reading:
             share(np.isneginf(r)), float(np.median(r[known])) if known.any() else float('nan')))
 
     def _find_tracks(self) -> None:
-        """All tracks there are, the one that clouds are placed by first."""
-        found = [odometry_track(name, messages) for name, messages in sorted(
-            self._odometry.items(), key=lambda item: item[0] == ODOMETRY)]
+        """All tracks there are; the one that the cloud is in, or is placed by, first.
+
+        A map is in the frame of a track that was made with it, not of the odometry it was made
+        from.
+        """
+        found = [odometry_track(name, messages) for name, messages in self._odometry.items()]
         found += [path_track(name, path) for name, path in self._last_path.items()]
         found.append(visual_track(f'{VISUAL}, chained', self._paths, self._steps))
-        self.contents.tracks = [track for track in found if track is not None]
+        known = [track for track in found if track is not None]
+        if MAP in self.contents.topics:
+            rank = {ODOMETRY: 1, f'{VISUAL}, chained': 2}
+        else:
+            rank = {ODOMETRY: -1, f'{VISUAL}, chained': 2}
+        self.contents.tracks = sorted(known, key=lambda track: (rank.get(track.name, 0),
+                                                                track.name))
 
 
 def _reads(name: str, kind: str) -> bool:
