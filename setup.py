@@ -11,7 +11,7 @@ setup(
     name=NAME,
     version='0.1.0',
     packages=find_packages(exclude=['test', 'test.*']),
-    package_data={NAME: ['ros/*.xml', 'report/web/*', 'py.typed']},
+    package_data={NAME: ['core/*.npz', 'ros/*.xml', 'report/web/*', 'py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from .frames import UNSCALED, Frame, Image8, Reference, RelativePose
 from .inverse_range import NOTHING, _grid_angles, _polar_row, pose_sigmas
 from .jit import fast_kernel, kernel, rows_in_parallel
+from .judgement import DEPENDENT, Found, Judged, by_agreement, by_looks
 from .matching import UNKNOWN, Matcher, Parallax, stereo_grid
 from .moving import off_meridian
 from .refinement import REACH, JointRefinement, Refined
 from .sphere import polar_axes
-from .sweep import REACH as SWEEP_REACH
-from .sweep import reduction, sweep
+from .sweep import sweep
 from .warp import Map, PolarGrid, polar_map, resample, with_border
 
 Floats = NDArray[np.float64]
@@ -31,12 +31,6 @@ Floats = NDArray[np.float64]
 # References of the sweep reach that many times as far as the nearest: beyond, its levels would
 # change faster than one a pixel on a road.
 _SWEPT = 5.0
-_AGREES, _LEVELS = 0.05, 0.75  # of the inverse range, or so many pixels at half size
-_SLACK = 1.5  # px of the nearest pair by which refinement may move what was matched
-# The error model, fitted to the tuning scenes: differences in grey within a window are not
-# independent, and no match is better than a share of a pixel.
-_MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
-_DEPENDENT, _FLOOR = 4.0, 0.17
 _WINDOWS = {'joint': (9, 9), 'joint_fast': (9,)}
 # Light: how far round about, of half a turn; grey levels; percentile that differs by a share.
 _LIGHT, _DARK, _MOSTLY, _ALIKE = 1 / 30, 8.0, 90, 0.08
@@ -51,6 +45,7 @@ class Measurement:
     other : the second opinion by itself
     agreed : uint8, 1 where the second opinion is the same
     moving : uint8 (H // 2, 2 * (H // 2)), 255 = leaves its meridian; None if that was not measured
+    told : standard deviation by what the grey tells alone, if nothing misleads it; None as moving
     """
 
     rho: Map
@@ -58,6 +53,7 @@ class Measurement:
     other: Map
     agreed: Image8
     moving: Image8 | None = None
+    told: Map | None = None
 
 
 def in_steps(pose: RelativePose) -> RelativePose:
@@ -115,14 +111,15 @@ def filled(rho: Map) -> Map:
 
 @kernel
 def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map, sin_lon: Map,
-                  axes: Map, at_pole: Map, rho: Map, information: Map, misfit: Map, other: Map,
-                  baselines: Map, ways: Map, pose: Map, tolerance: Map, out: Map, sigma_out: Map,
-                  other_out: Map, agreed: Image8) -> None:  # pragma: no cover - compiled
-    """Sample the polar grid; σ and agreement of every pixel.
+                  axes: Map, at_pole: Map, rho: Map, error: Map, sure: Image8, other: Map,
+                  baselines: Map, ways: Map, pose: Map, told: Map, out: Map,
+                  sigma_out: Map, other_out: Map, agreed: Image8,
+                  told_out: Map) -> None:  # pragma: no cover - compiled
+    """Sample the polar grid; σ of every pixel, with the pose's share.
 
-    at_pole : column of the pole, row of the azimuth 0, rad of a pixel; ways : (references, 3)
-    directions of motion; pose : (references, 3) standard deviations of rotation, direction,
-    baseline; tolerance : see `_tolerance`
+    at_pole : column of the pole, row of the azimuth 0, rad of a pixel, px that no match beats;
+    ways : (references, 3) directions of motion; pose : (references, 3) standard deviations of
+    rotation, direction, baseline
     """
     at = np.empty((4, cos_lon.size), np.float32)
     half, nothing = np.float32(0.5), np.float32(NOTHING)
@@ -147,23 +144,16 @@ def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Ma
                 if abs(value) * baselines[n] < np.float32(REACH) and (
                         baselines[n] * s > baselines[k] * sine):
                     k, sine, cosine = n, s, c
-            match = np.float32(_FLOOR) * at_pole[2]
+            match = at_pole[3] * at_pole[2]
             by_angle = np.sqrt(match * match + pose[k, 0] * pose[k, 0]) / (baselines[k] * sine)
             by_pose = value * (cosine / sine * pose[k, 1] + pose[k, 2])
-            told = np.float32(_DEPENDENT * _DEPENDENT) / max(information[rn, cn],
-                                                            np.float32(1e-9))
+            likely = error[rn, cn]
             out[i, j] = value
-            sigma_out[i, j] = min(np.sqrt(told + by_angle * by_angle + by_pose * by_pose), nothing)
-            second = other[rn, cn]
-            other_out[i, j] = second
-            pixels = tolerance[2, tolerance.shape[1] - 1]
-            for n in range(tolerance.shape[1]):
-                if abs(value) * tolerance[0, n] < tolerance[1, n]:
-                    pixels = tolerance[2, n]
-                    break
-            allowed = max(tolerance[3, 0] * abs(value), pixels)
-            agreed[i, j] = np.uint8((abs(value - second) < allowed)
-                                     & (misfit[rn, cn] < np.float32(_MISFIT)))
+            sigma_out[i, j] = min(np.sqrt(likely * likely + by_angle * by_angle
+                                          + by_pose * by_pose), nothing)
+            other_out[i, j] = other[rn, cn]
+            agreed[i, j] = sure[rn, cn]
+            told_out[i, j] = told[rn, cn]
 
 
 class JointMatcher:
@@ -194,15 +184,21 @@ class JointMatcher:
         refined = self._refined(view, grid, axes, pairs, filled(matched))
         moving = off_meridian(parallax, refined.misfit, grid, axes, pairs[0][1], height)
         if self._sweeps:
-            swept = self._swept(pairs)
-            coarse, _ = sweep(view, grid, axes, swept)
+            coarse, _ = sweep(view, grid, axes, self._swept(pairs))
             other = cv2.resize(coarse, grid.shape[::-1], interpolation=cv2.INTER_LINEAR)
-            tolerance = _tolerance([p.baseline for _, p in swept],
-                                   reduction(height) * grid.pixel)
         else:
-            other, tolerance = matched, _tolerance_of_match(pairs[0][1].baseline, grid.pixel)
-        measured = self._on_sphere(refined, other, tolerance, grid, axes, pairs, height)
+            other = matched
+        found = Found(view, refined, other, matched, parallax)
+        judged = self._judged(found, grid, axes, pairs)
+        measured = self._on_sphere(refined, judged, grid, axes, pairs, height)
         return replace(measured, moving=moving)
+
+    def _judged(self, found: Found, grid: PolarGrid, axes: Floats,
+                pairs: Sequence[tuple[Image8, RelativePose]]) -> Judged:
+        del axes
+        if self._sweeps:
+            return by_looks(found, grid, [p.baseline for _, p in pairs])
+        return by_agreement(found, found.other, grid, pairs[0][1].baseline, swept=False)
 
     def _swept(self, pairs: Sequence[tuple[Image8, RelativePose]],
                ) -> list[tuple[Image8, RelativePose]]:
@@ -224,35 +220,22 @@ class JointMatcher:
             found = refinement.refined(found.rho, window)
         return found
 
-    def _on_sphere(self, refined: Refined, other: Map, tolerance: Map, grid: PolarGrid,
-                   axes: Floats, pairs: Sequence[tuple[Image8, RelativePose]],
-                   height: int) -> Measurement:
-        rho, sigma, second = (np.empty((height, 2 * height), np.float32) for _ in range(3))
-        agreed = np.empty(rho.shape, np.uint8)
-        at_pole = np.array([grid.margin - 0.5, grid.wrap - 0.5, grid.pixel], np.float32)
+    def _on_sphere(self, refined: Refined, judged: Judged, grid: PolarGrid, axes: Floats,
+                   pairs: Sequence[tuple[Image8, RelativePose]], height: int) -> Measurement:
+        rho, sigma, second, told = (np.empty((height, 2 * height), np.float32) for _ in range(4))
+        noise = np.float32(DEPENDENT) / np.sqrt(np.maximum(refined.information, 1e-9))
+        sure = np.empty(rho.shape, np.uint8)
+        at_pole = np.array([grid.margin - 0.5, grid.wrap - 0.5, grid.pixel, judged.floor],
+                           np.float32)
         poses = np.array([pose_sigmas(p) for _, p in pairs], np.float32)
         poses[poses[:, 2] == 0, 2] = self._baseline_sigma
         baselines = np.array([p.baseline for _, p in pairs], np.float32)
         ways = np.array([p.direction for _, p in pairs], np.float32)
         rows_in_parallel(_measure_rows, height, *_grid_angles(height),
                          np.ascontiguousarray(axes, np.float32), at_pole, refined.rho,
-                         refined.information, refined.misfit, other, baselines, ways, poses,
-                         tolerance, rho, sigma, second, agreed)
-        return Measurement(rho, sigma, second, agreed)
-
-
-def _tolerance(baselines: Sequence[float], pixel: float) -> Map:
-    """How far the sweep, of that `pixel` (rad), may be off, (4, N), longest baseline first:
-    baseline, the most of baseline over range to which it holds, 1/m; and in the last row the share
-    of the inverse range.
-    """
-    rows = [(b, SWEEP_REACH, _LEVELS * pixel / b, _AGREES)
-            for b in sorted(baselines, reverse=True)]
-    return np.array(rows, np.float32).T.copy()
-
-
-def _tolerance_of_match(baseline: float, pixel: float) -> Map:
-    return np.array([[baseline, 1e9, _SLACK * pixel / baseline, 0.0]], np.float32).T.copy()
+                         judged.error, judged.sure, judged.other, baselines, ways, poses, noise,
+                         rho, sigma, second, sure, told)
+        return Measurement(rho, sigma, second, sure, told=told)
 
 
 def in_one_light(image: Image8, model: Image8) -> tuple[Image8, Image8]:

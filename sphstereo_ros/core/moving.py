@@ -217,7 +217,9 @@ def moving_parts(known: Remembered, measured: Measurement,
     signs = np.zeros(half[::-1], np.uint8) if measured.moving is None else measured.moving
     if plane is not None:
         wrong |= under_floor(known.rho, known.sigma, plane) != 0
-        under = under_floor(measured.rho, measured.sigma, plane) * measured.agreed
+        # What keeps pace looks like nothing that was fitted to: both opinions, not its sigma.
+        told = measured.sigma if measured.told is None else measured.told
+        under = under_floor(measured.rho, told, plane) & under_floor(measured.other, told, plane)
         signs = signs | cv2.resize(under, half, interpolation=cv2.INTER_NEAREST)
     moving = cv2.resize(cleaned(signs), (width, height), interpolation=cv2.INTER_NEAREST)
     return wrong | (moving != 0), np.asarray(moving, np.uint8)

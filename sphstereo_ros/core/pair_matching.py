@@ -13,11 +13,12 @@ import numpy as np
 
 from .frames import Frame, Image8, Reference, RelativePose
 from .inverse_range import NOTHING, InverseRange, _grid_angles, inverse_range
-from .joint import Floats, JointMatcher, Measurement, in_steps
+from .joint import Floats, JointMatcher, in_steps
+from .judgement import Found, Judged, by_agreement
 from .matching import Matcher, Parallax, stereo_grid
-from .refinement import JointRefinement, Refined
+from .refinement import JointRefinement
 from .sphere import polar_axes
-from .warp import Map, PolarGrid
+from .warp import PolarGrid
 
 _WINDOWS = (15,)  # px: one reference tells less of a pixel than several
 _ALIKE = 1.0  # px by which a match and its refinement may differ
@@ -60,7 +61,6 @@ class PairMatcher(JointMatcher):
         super().__init__(method, first, baseline_sigma)
         self._several = self._windows
         self._found: Parallax | None = None
-        self._view = np.empty((0, 0), np.uint8)
 
     def measured(self, current: Frame, references: Sequence[Reference]) -> InverseRange:
         """Inverse range on the current frame's grid, and its sigma.
@@ -94,16 +94,15 @@ class PairMatcher(JointMatcher):
 
     def _parallax(self, view: Image8, nearest: tuple[Image8, RelativePose], grid: PolarGrid,
                   axes: Floats) -> Parallax:
-        self._view = view
         self._found = super()._parallax(view, nearest, grid, axes)
         return self._found
 
-    def _on_sphere(self, refined: Refined, other: Map, tolerance: Map, grid: PolarGrid,
-                   axes: Floats, pairs: Sequence[tuple[Image8, RelativePose]],
-                   height: int) -> Measurement:
-        """Of what the sweep sees, what is nearer counts only where the pictures bear it out."""
+    def _judged(self, found: Found, grid: PolarGrid, axes: Floats,
+                pairs: Sequence[tuple[Image8, RelativePose]]) -> Judged:
+        """What the sweep sees nearer counts only where the pictures bear it out."""
+        rho, other = found.refined.rho, found.other
         if self._sweeps:
-            fit = JointRefinement(self._view, grid, axes, pairs[:1]).misfit(other)
-            fits = fit < _FITS * refined.misfit + _GREY
-            other = np.where(fits | (other < _NEARER * refined.rho), other, np.float32(0))
-        return super()._on_sphere(refined, other, tolerance, grid, axes, pairs, height)
+            fit = JointRefinement(found.view, grid, axes, pairs[:1]).misfit(other)
+            fits = fit < _FITS * found.refined.misfit + _GREY
+            other = np.where(fits | (other < _NEARER * rho), other, np.float32(0))
+        return by_agreement(found, other, grid, pairs[0][1].baseline, self._sweeps)

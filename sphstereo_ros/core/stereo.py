@@ -23,7 +23,6 @@ from .joint import JointMatcher
 from .matching import matcher, stereo_grid
 from .moving import moving_parts, under_floor
 from .pair_matching import PairMatcher, with_cones
-from .planes import on_planes
 from .range_memory import RangeMemory
 from .rig import Rig
 from .rotations import mount
@@ -109,12 +108,7 @@ class SphericalStereo:
             moving[mask != 0] = 0
         self._memory.forget(wrong)
         fused.sigma[wrong] = NOTHING
-        believed = on_planes(fused.rho, fused.sigma, measured.rho, measured.other)
-        believed &= ~wrong & (moving == 0)
-        if mask is not None:
-            believed &= mask == 0
-        return InverseRange(np.where(believed, measured.rho, fused.rho),
-                            np.where(believed, measured.sigma, fused.sigma), joint.signed), moving
+        return InverseRange(fused.rho, fused.sigma, joint.signed), moving
 
     def _measure(self, current: Frame, reference: Reference) -> InverseRange:
         height = current.image.shape[0]

@@ -1,0 +1,76 @@
+"""What was found on a polar grid, and how far it is believed: by its looks, or by agreement."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .frames import Image8
+from .matching import Parallax
+from .refinement import Refined
+from .reliability import expected_error, look, network
+from .sweep import reduction
+from .warp import Map, PolarGrid
+
+MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
+_SURE = 0.5  # of the unit: a likely error with which something counts as measured
+# Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
+# and refinement may move what was matched by so many pixels.
+_AGREES, _LEVELS, _SLACK = 0.05, 0.75, 1.5
+DEPENDENT = 4.0  # times the noise: differences in grey within a window are not independent
+_FLOOR = 0.17  # px: no match beats that
+
+
+@dataclass(frozen=True)
+class Found:
+    """What is known of a window on its polar grid, before it is judged.
+
+    view : the current view; refined : the measurement; other : second opinion, 1/m;
+    matched, parallax : what the nearest pair's matcher found, 1/m and px
+    """
+
+    view: Image8
+    refined: Refined
+    other: Map
+    matched: Map
+    parallax: Parallax
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Second opinion and likely error (1/m) on the polar grid; sure : 1 = counts as measured.
+
+    floor : px that no match beats, if the error does not tell them
+    """
+
+    other: Map
+    error: Map
+    sure: Image8
+    floor: float = 0.0
+
+
+def by_looks(found: Found, grid: PolarGrid, baselines: Sequence[float]) -> Judged:
+    """What looks as here errs so much as a rule; baselines of the references in m."""
+    seen = look(found.view, found.refined, found.other, found.matched, found.parallax)
+    error, unit = expected_error(seen, grid, baselines, network())
+    sure = (error < _SURE * unit) & (found.refined.misfit < MISFIT)
+    return Judged(found.other, error, sure.astype(np.uint8))
+
+
+def by_agreement(found: Found, other: Map, grid: PolarGrid, baseline: float,
+                 swept: bool) -> Judged:
+    """Sure where both opinions are the same; the error is what noise and pixels tell.
+
+    other : the second opinion, of a sweep where `swept`, else what was matched
+    baseline : of the nearest reference, m
+    """
+    rho, pixel = found.refined.rho, grid.pixel / baseline
+    allowed = np.full_like(rho, _SLACK * pixel)
+    if swept:
+        allowed = np.maximum(np.float32(_AGREES) * np.abs(rho),
+                             np.float32(_LEVELS * reduction(grid.height) * pixel))
+    information = np.maximum(found.refined.information, np.float32(1e-9))
+    error = np.asarray(np.float32(DEPENDENT) / np.sqrt(information), np.float32)
+    sure = (np.abs(rho - other) < allowed) & (found.refined.misfit < MISFIT)
+    return Judged(other, error, sure.astype(np.uint8), _FLOOR)

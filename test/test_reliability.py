@@ -1,0 +1,127 @@
+"""How far a measurement errs, by its looks."""
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sphstereo_ros.bench.reliability import HIDDEN, Fit, Samples, fit
+from sphstereo_ros.core.matching import UNKNOWN, Parallax, stereo_grid
+from sphstereo_ros.core.refinement import Refined
+from sphstereo_ros.core.reliability import (
+    LOOKS,
+    Network,
+    expected_error,
+    look,
+    looks_at,
+    network,
+)
+
+GRID = stereo_grid(64)
+BASELINES = (0.3, 1.2)
+
+
+def found(rng: np.random.Generator, scale: float = 1.0):
+    """A measurement of a world `scale` times as large: view, refined, other, matched, parallax."""
+    shape = GRID.shape
+    rho = rng.uniform(0.02, 1, shape).astype(np.float32)
+    other = (rho * rng.uniform(0.8, 1.2, shape)).astype(np.float32)
+    matched = np.where(rng.random(shape) < 0.2, UNKNOWN, rho * 1.02 / scale).astype(np.float32)
+    information = rng.uniform(1e2, 1e6, shape).astype(np.float32) * scale**2
+    misfit = rng.uniform(1, 200, shape).astype(np.float32)
+    half = rng.uniform(0.1, 2, (shape[0] // 2, shape[1] // 2)).astype(np.float32)
+    view = rng.integers(0, 255, shape).astype(np.uint8)
+    refined = Refined((rho / scale).astype(np.float32), information.astype(np.float32), misfit)
+    return (view, refined, (other / scale).astype(np.float32), matched,
+            Parallax(np.zeros(shape, np.float32), half, signed=True))
+
+
+def everywhere() -> tuple[np.ndarray, np.ndarray]:
+    rows, columns = np.indices(GRID.shape)
+    return rows.ravel(), columns.ravel()
+
+
+def outputs(looks: np.ndarray, net: Network) -> np.ndarray:
+    x = looks.astype(np.float64)
+    for n, (weight, bias) in enumerate(zip(net.weights, net.biases, strict=True)):
+        x = x @ weight + bias
+        x = np.maximum(x, 0.1 * x) if n < 2 else x
+    return x
+
+
+def test_the_network_that_is_shipped_has_the_stated_shape():
+    net = network()
+    assert [w.shape for w in net.weights] == [(LOOKS, 24), (24, 16), (16, 3)]
+    assert all(np.isfinite(m).all() for m in (*net.weights, *net.biases))
+
+
+def test_the_compiled_network_is_the_network():
+    parts = found(np.random.default_rng(1))
+    seen = look(*parts)
+    looks, unit = looks_at(seen, GRID, BASELINES, *everywhere())
+    error, units = expected_error(seen, GRID, BASELINES, network())
+    np.testing.assert_array_equal(unit, units.ravel())
+    out = outputs(looks, network())
+    likely = unit * np.exp(np.maximum(out[:, 0], out[:, 1] - 1.1))
+    nearer = unit * np.exp(out[:, 2])
+    margin = (parts[1].rho.ravel() + nearer) * min(BASELINES) * 40
+    likely = np.where(margin > 1, np.maximum(likely, 0.67 * nearer), likely)
+    exact = np.hypot(likely, 1 / np.sqrt(parts[1].information.ravel()))
+    decided = np.abs(margin - 1) > 1e-2
+    assert (margin[decided] > 1).any()
+    np.testing.assert_allclose(error.ravel()[decided], exact[decided], rtol=2e-3)
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.floats(0.01, 100), st.integers(0, 100))
+def test_only_what_is_relative_counts(scale, seed):
+    """A world ten times as large, seen over baselines ten times as long, looks the same."""
+    small, large = (look(*found(np.random.default_rng(seed), s)) for s in (1.0, scale))
+    a, unit_a = expected_error(small, GRID, BASELINES, network())
+    b, unit_b = expected_error(large, GRID, [scale * x for x in BASELINES], network())
+    np.testing.assert_allclose(unit_b * scale, unit_a, rtol=1e-4)
+    np.testing.assert_allclose(b * scale, a, rtol=0.02)
+
+
+def test_grey_that_tells_nothing_is_never_sure():
+    view, refined, other, matched, parallax = found(np.random.default_rng(2))
+    blank = Refined(refined.rho, np.zeros_like(refined.information), refined.misfit)
+    error, unit = expected_error(look(view, blank, other, matched, parallax), GRID, BASELINES,
+                                 network())
+    assert (error > 1e3 * unit).all()
+
+
+def test_where_opinions_differ_the_error_is_larger():
+    view, _, _, _, parallax = found(np.random.default_rng(3))
+    rho = np.full(GRID.shape, 0.2, np.float32)
+    smooth = Refined(rho, np.full_like(rho, 1e6), np.full_like(rho, 5))
+    errors = [expected_error(look(view, smooth, rho * share, rho, parallax), GRID, BASELINES,
+                             network())[0][GRID.wrap:-GRID.wrap, 20:-20]
+              for share in (np.float32(1), np.float32(1.5), np.float32(0.3))]
+    assert np.median(errors[1]) > 2 * np.median(errors[0])
+    assert np.median(errors[2]) > 2 * np.median(errors[0])
+
+
+def test_a_fit_finds_the_percentiles():
+    """Errors that are Gaussian, of a standard deviation that one look tells."""
+    rng = np.random.default_rng(0)
+    looks = rng.normal(size=(60000, LOOKS)).astype(np.float32)
+    sigma = 0.05 * np.exp(0.5 * looks[:, 3])
+    error = (sigma * rng.normal(size=len(looks))).astype(np.float32)
+    fitted = fit([Samples(looks, error, np.ones_like(error))], rng, steps=3000)
+    out = np.exp(fitted.layers(looks)[-1])
+    assert np.median(out[:, 0] / (sigma + 0.003)) == pytest.approx(1.0, abs=0.1)
+    assert np.median(out[:, 1] / (2 * sigma + 0.003)) == pytest.approx(1.0, abs=0.15)
+    assert np.median(out[:, 2] / (2.054 * sigma + 0.003)) == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_saved_fit_is_read_as_it_was(tmp_path):
+    rng = np.random.default_rng(0)
+    looks = (5 + 3 * rng.normal(size=(1000, LOOKS))).astype(np.float32)
+    fitted = Fit(looks, rng)
+    fitted.save(tmp_path / 'net.npz')
+    data = np.load(tmp_path / 'net.npz')
+    net = Network(*(tuple(data[f'{name}{n}'] for n in range(3)) for name in ('weight', 'bias')))
+    assert [w.shape[1] for w in net.weights] == [*HIDDEN, 3]
+    np.testing.assert_allclose(outputs(looks, net), fitted.layers(looks)[-1], atol=1e-3)
