@@ -203,15 +203,16 @@ def test_a_speck_under_the_floor_is_wrong_but_does_not_move():
     known = Remembered(rho.copy(), sigma.copy(), np.ones_like(rho))
     known.rho[140, 100] = 1 / 100
     known.sigma[140, 100] = 1e-3
-    new = Measurement(rho, sigma, rho, np.ones(rho.shape, np.uint8))
+    new = Measurement(rho, sigma, rho.copy(), np.ones(rho.shape, np.uint8))
     wrong, moving = moving_parts(known, new, DOWN)
     assert np.argwhere(wrong).tolist() == [[140, 100]]
     assert not moving.any()
-    new.rho[130:150, 90:110] = 1 / 100
+    seen_there = new.other.copy()
+    new.rho[130:150, 90:110] = new.other[130:150, 90:110] = 1 / 100
     wrong, moving = moving_parts(known, new, DOWN)
     assert (moving[130:150, 90:110] == 255).all()
     assert wrong[moving == 255].all()
-    new.agreed[:] = 0
+    new.other[:] = seen_there  # a second opinion that knows nothing of it
     assert not moving_parts(known, new, DOWN)[1].any()
 
 
