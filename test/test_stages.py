@@ -378,7 +378,7 @@ def test_what_the_mask_covers_neither_moves_nor_has_range(mask_height):
     got = measured(current, (reference, exact(reference, current)), mask=mask)
     assert np.isnan(got.range[-(HEIGHT // 3):]).all()
     assert np.isnan(got.sigma[-(HEIGHT // 3):]).all()
-    assert np.isfinite(got.range[:-(HEIGHT // 3)]).mean() > 0.9
+    assert np.isfinite(got.range[:-(HEIGHT // 3)]).mean() > 0.8
 
 
 def test_a_mask_over_everything_leaves_no_points():
