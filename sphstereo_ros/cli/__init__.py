@@ -18,6 +18,7 @@ from sphstereo_ros.core.config import ParameterError
 # Name → module with add_arguments(parser) and main(arguments) → exit status, and what it does.
 COMMANDS = {
     'run': ('sphstereo_ros.cli.run', 'depth and clouds from a bag, a video or frames, offline'),
+    'map': ('sphstereo_ros.cli.map', 'a drive or flight into one cloud and its track'),
     'replay': ('sphstereo_ros.cli.replay', 'publish the inputs in a bag live, with /clock'),
     'import': ('sphstereo_ros.cli.import_video', 'any 360° video into a bag'),
     'report': ('sphstereo_ros.cli.report', 'a page on a file of results: depth, cloud, errors, '
