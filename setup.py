@@ -5,7 +5,7 @@ from setuptools import find_packages, setup
 
 NAME = 'sphstereo_ros'
 NODES = ('frame_pairing', 'pose_stabilisation', 'motion_alignment', 'spherical_stereo',
-         'obstacle_detection', 'pipeline', 'bag_replay')
+         'obstacle_detection', 'mapping', 'pipeline', 'bag_replay')
 
 setup(
     name=NAME,
@@ -27,10 +27,10 @@ setup(
         'plots': ['matplotlib'],
         'report': ['jinja2', 'matplotlib'],
         'view': ['rerun-sdk>=0.24'],
-        'map': ['small_gicp>=1.0', 'plyfile', 'pypcd4', 'laspy'],
+        'map': ['small-gicp>=1.0', 'plyfile', 'pypcd4', 'laspy'],
         'mavlink': ['pymavlink', 'pyserial'],
         'test': ['pytest', 'hypothesis', 'mcap-ros2-support', 'pymavlink', 'pyserial',
-                 'small_gicp>=1.0', 'plyfile', 'pypcd4', 'laspy', 'evo'],
+                 'small-gicp>=1.0', 'plyfile', 'pypcd4', 'laspy', 'evo'],
         'dev': ['ruff', 'mypy', 'types-PyYAML', 'pytest-cov'],
     },
     zip_safe=False,

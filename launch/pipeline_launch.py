@@ -33,6 +33,8 @@ def actions(context):
     stages = STAGES
     if argument('obstacles').lower() == 'true':
         stages = (*STAGES, 'obstacle_detection')
+    if argument('mapping').lower() == 'true':
+        stages = (*stages, 'mapping')
     camera = load_config([Path(file) for file in files]).camera
     nodes = [Node(package=PACKAGE, executable=stage, name=stage,
                   namespace=argument('namespace'), output='screen',
@@ -55,6 +57,8 @@ def generate_launch_description():
                               description='frame_id of the input images'),
         DeclareLaunchArgument('obstacles', default_value='true',
                               description='false leaves obstacle_detection out'),
+        DeclareLaunchArgument('mapping', default_value='false',
+                              description='true adds mapping'),
         DeclareLaunchArgument('use_sim_time', default_value='false',
                               description='true where /clock is published'),
         OpaqueFunction(function=actions)])

@@ -80,6 +80,7 @@ def _mapped(run: MapRun, out: Path) -> int:
             return INTERRUPTED
     frames, points = run.join()
     if not frames:
+        run.remove_chunks()
         causes = ', '.join(run.summary.drops) or 'too few frames'
         raise BadInput(f'no frame could be placed ({causes})')
     track = out.with_suffix('.tum')

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 
 from .camera import Equirectangular
+from .cloud import BYTES_PER_POINT, MAX_BYTES
 from .config import Config, MappingConfig
 from .frames import (
     AlignedWindow,
@@ -58,7 +59,7 @@ class Submap:
 
     frames : where they were taken; points : all voxels, fused ones and single ones
     assumed, tracked : length of the way as it was assumed, and as it was tracked: of frames whose
-    windows have scales of their own
+    points are in it and whose windows have scales of their own
     """
 
     frames: list[TrackedFrame]
@@ -161,7 +162,7 @@ class Mapper:
             self._odometry = first_pose(self._config, odometry)
         else:
             self._odometry = None
-        if not self._lag:
+        if fuse and not self._lag:
             self._steps.append((window.current.key, window.references[0].pose.baseline))
         if fuse:
             self._waiting.append(self._scan(image, colours or window.current))
@@ -180,6 +181,26 @@ class Mapper:
             return Submap(frames, self.voxels.points())
         return Submap(frames, self.voxels.points(), sum(step for _, step in self._steps),
                       sum(self.track[key].scale * step for key, step in self._steps))
+
+    def cloud(self, stamp: int) -> PointCloud:
+        """What is worth keeping so far, in `odom`: so many points that they take up to 8 MB."""
+        points = confirmed(self.voxels.points(), np.array([f.position for f in self._fused]),
+                           self._config.mapping)
+        most = MAX_BYTES // BYTES_PER_POINT
+        if len(points) > most:  # voxels come in the order of a hash: any part is even
+            points = points.chosen(np.linspace(0, len(points) - 1, most).astype(np.intp))
+        return map_cloud(points, stamp)
+
+    def warm_up(self) -> None:
+        """Compile what `add` and `cloud` need; only before the first frame."""
+        key = FrameKey(0, '')
+        nothing = np.full((8, 16), np.nan, np.float32)
+        scan = self._scan(RangeImage(key, nothing, nothing, True),
+                          Frame(key, np.zeros((8, 16), np.uint8)))
+        self.voxels.add(scan.xyz, scan.sigma, scan.bgr, 0)
+        self.voxels.points()
+        distance_to_track(np.zeros((1, 3), np.float32), np.zeros((1, 3)))
+        self._count = 0
 
     @property
     def fused(self) -> list[TrackedFrame]:

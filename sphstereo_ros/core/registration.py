@@ -17,14 +17,21 @@ _REACH = 0.5  # m, of correspondences
 _LEAST_POINTS = 500
 _LEAST_SHARE = 0.5  # of the source's points that must find a partner
 _MOST_ERROR = 0.15  # m, of points that have a partner: root mean square
+# Share of the surfaces that must face each way (a third if all ways are alike): between two walls
+# clouds slide along.
+_LEAST_FACING = 0.08
 
 
-def registered(target: Map32, source: Map32, start: RelativePose) -> RelativePose | Drop:
+def registered(target: Map32, source: Map32, start: RelativePose,
+               measured: bool = False) -> RelativePose | Drop:
     """Pose of the source cloud in the target's frame.
 
     target, source : (N, 3) metres; start : about where the source is
+    measured : whether `start` comes from a sensor: then the clouds do not move the way that they
+        can slide
 
-    Drops: `no_registration` without the library; `not_registered`, where the clouds do not fit.
+    Drops: `no_registration` without the library; `not_registered`, where the clouds do not fit,
+    or can slide.
     """
     try:
         import small_gicp
@@ -47,5 +54,9 @@ def registered(target: Map32, source: Map32, start: RelativePose) -> RelativePos
     error = (2 * result.error / max(result.num_inliers, 1))**0.5
     if not np.isfinite(pose).all() or share < _LEAST_SHARE or error > _MOST_ERROR:
         return Drop('not_registered', f'{100 * share:.0f} % of the points fit, to {error:.2f} m')
+    facing, ways = np.linalg.eigh(np.asarray(result.H)[3:, 3:] / result.num_inliers)
+    firm = ways[:, facing > _LEAST_FACING]
+    if firm.shape[1] < 3 and not measured:
+        return Drop('not_registered', 'the clouds can slide')
     rotation: Floats = pose[:3, :3]
-    return RelativePose(rotation, pose[:3, 3] + moved - rotation @ centre)
+    return RelativePose(rotation, firm @ firm.T @ pose[:3, 3] + moved - rotation @ centre)

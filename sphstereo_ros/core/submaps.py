@@ -126,7 +126,7 @@ class MapBuilder:
             believed = self._by_last_motion(first.key.stamp, follows)
         start = compose(believed, inverse(RelativePose(first.rotation, first.position)))
         target = _near(self._voxels.points(), last.position)
-        found = registered(target, _near(submap.points, first.position), start)
+        found = registered(target, _near(submap.points, first.position), start, by_odometry)
         if isinstance(found, Drop):
             if not by_odometry:
                 return Drop('not_joined', f'{found.cause}: {found.detail}')

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from . import rotations
 from .frames import AlignedWindow, Drop, FrameKey, RelativePose
 from .joint import in_steps
 from .pose_graph import Edges, Floats, Poses, Priors, optimised, whitening
@@ -59,6 +60,7 @@ class Track:
         self._edges: list[tuple[int, int, RelativePose, Floats]] = []
         self._scales: dict[int, tuple[float, float]] = {}
         self._index: dict[FrameKey, int] = {}
+        self._newest: FrameKey | None = None
 
     def __len__(self) -> int:
         return len(self._keys)
@@ -72,7 +74,7 @@ class Track:
     @property
     def frames(self) -> list[TrackedFrame]:
         """All frames that are remembered, in order of time."""
-        return [self._frame(n) for n in range(len(self))]
+        return sorted((self._frame(n) for n in range(len(self))), key=lambda f: f.key)
 
     def _frame(self, n: int) -> TrackedFrame:
         poses = self._poses
@@ -81,9 +83,7 @@ class Track:
 
     def add(self, window: AlignedWindow, link: RelativePose | None = None,
             scale: tuple[float, float] | None = None) -> TrackedFrame | Drop:
-        """Place the current frame.
-
-        The first window's nearest reference is placed, too.
+        """Place the current frame, and those of its references that have no place yet.
 
         Parameters
         ----------
@@ -98,8 +98,8 @@ class Track:
 
         """
         key = window.current.key
-        if self._keys and key.stamp <= self._keys[-1].stamp:
-            return Drop('stamp_backward', f'{key.stamp} after {self._keys[-1].stamp}')
+        if self._newest is not None and key.stamp <= self._newest.stamp:
+            return Drop('stamp_backward', f'{key.stamp} after {self._newest.stamp}')
         references = [(r.frame.key, in_steps(r.pose)) for r in window.references
                       if not r.is_beside(window.current)]
         log_scale = math.log(scale[0]) if scale else None
@@ -109,15 +109,19 @@ class Track:
         known = [(self._index[k], pose) for k, pose in references if k in self._index]
         if known:
             self._place(key, known, log_scale)
-        elif link is not None and self._keys:
-            self._append_linked(key, link, log_scale)
+        elif link is not None and self._newest is not None:
+            self._append_linked(key, link, self._index[self._newest], log_scale)
         else:
             return Drop('track_lost', f'{len(references)} references, none with a place')
+        current = self._index[key]
         if scale is not None and self._free:
-            self._scales[len(self) - 1] = math.log(scale[0]), scale[1]
+            self._scales[current] = math.log(scale[0]), scale[1]
+        self._place_others(current, references)
         self._adjust(len(self) - _ADJUSTED, _ITERATIONS)
+        self._newest = key
+        placed = self._frame(current)
         self._forget()
-        return self._frame(len(self) - 1)
+        return placed
 
     def adjust_all(self, iterations: int = 8) -> None:
         """Adjust all frames together."""
@@ -131,31 +135,45 @@ class Track:
                             np.concatenate([poses.positions, position[None]]),
                             np.append(poses.log_scales, log_scale))
 
-    def _append_linked(self, key: FrameKey, link: RelativePose, log_scale: float | None) -> None:
+    def _append_linked(self, key: FrameKey, link: RelativePose, before: int,
+                       log_scale: float | None) -> None:
         """A pose behind a gap: its window's scale is that of the last one, until more is known."""
-        last = self._frame(len(self) - 1)
+        last = self._frame(before)
         rotation = last.rotation @ link.rotation.T
         self._append(key, rotation, last.position - rotation @ link.position,
-                     self._poses.log_scales[-1] if log_scale is None else log_scale)
+                     self._poses.log_scales[before] if log_scale is None else log_scale)
         scale = math.exp(self._poses.log_scales[-1])
         unit = RelativePose(link.rotation, link.position / scale, link.covariance)
-        self._edges.append((len(self) - 1, len(self) - 2, unit, self._whitening(unit, True)))
+        self._edges.append((len(self) - 1, before, unit, self._whitening(unit, True)))
+
+    def _place_others(self, current: int, references: list[tuple[FrameKey, RelativePose]]) -> None:
+        """Where windows were left out, their frames are only references: they hold the track
+        together.
+        """
+        placed = self._frame(current)
+        for key, pose in references:
+            if key in self._index:
+                continue
+            self._append(key, placed.rotation @ pose.rotation, placed.position
+                         + placed.scale * placed.rotation @ pose.position,
+                         math.log(placed.scale))
+            self._edges.append((current, len(self) - 1, pose, self._whitening(pose, False)))
 
     def _place(self, key: FrameKey, known: list[tuple[int, RelativePose]],
                log_scale: float | None) -> None:
-        """A first pose: turned as the farthest reference tells, placed by all."""
+        """A first pose: turned as the reference tells that most agree with, placed by all."""
         poses = self._poses
-        farthest, pose = max(known, key=lambda r: r[1].baseline)
-        rotation = poses.rotations[farthest] @ pose.rotation.T
+        rotation = _middle([poses.rotations[n] @ pose.rotation.T for n, pose in known])
         there = np.stack([poses.positions[n] for n, _ in known])
         way = np.stack([rotation @ p.position for _, p in known])
-        chosen = float(poses.log_scales[-1]) if log_scale is None else log_scale
+        before = -1 if self._newest is None else self._index[self._newest]
+        chosen = float(poses.log_scales[before]) if log_scale is None else log_scale
         if self._free and len(known) > 1:
             a, b = way - way.mean(axis=0), there - there.mean(axis=0)
             told = float((a * b).sum() / max((a * a).sum(), 1e-12))
             if abs(math.log(max(told, 1e-12)) - chosen) < math.log(_MOST_CHANGE):
                 chosen = math.log(told)
-        position = (there - math.exp(chosen) * way).mean(axis=0)
+        position = np.median(there - math.exp(chosen) * way, axis=0)
         self._append(key, rotation, position, chosen if self._free else 0.0)
         nearest = min(p.baseline for _, p in known)
         for n, each in known:
@@ -218,3 +236,9 @@ class Track:
         self._edges = [(i - count, k - count, pose, white) for i, k, pose, white in self._edges
                        if k >= count]
         self._scales = {n - count: value for n, value in self._scales.items() if n >= count}
+
+
+def _middle(candidates: list[Floats]) -> Floats:
+    """The rotation that is nearest to the others."""
+    apart = [sum(rotations.angle(a.T @ b) for b in candidates) for a in candidates]
+    return candidates[int(np.argmin(apart))]

@@ -215,7 +215,7 @@ class MapRun:
                 if any(p.suffix not in ('.npz', '.json') for p in self.folder.iterdir()):
                     raise BadInput(f'{self.folder} is in the way: it holds other files')
                 shutil.rmtree(self.folder)
-            self.folder.mkdir(parents=True, exist_ok=True)
+            self.folder.mkdir(exist_ok=True)
             for left in self.folder.glob('.*'):
                 left.unlink()
         except OSError as error:

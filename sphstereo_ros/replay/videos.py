@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
@@ -20,6 +21,8 @@ FRAME_SUFFIXES = ('.jpg', '.jpeg', '.png')
 CAMERA = 'camera_optical'
 DEFAULT_FPS = 30.0
 HIGHEST_FPS = 1000.0
+# What a file lacks is told in one line; FFmpeg's own log would stand beside it.
+os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ __all__ = [
     'decode_frame', 'depth_message', 'diagnostic_message', 'frame_key', 'frame_message', 'header',
     'image_message', 'imu_sample', 'nanoseconds', 'odometry_message', 'odometry_sample',
     'read_cloud', 'read_depth', 'read_stamped_depth', 'read_window', 'time_message',
-    'twist_sample', 'window_message',
+    'track_message', 'twist_sample', 'window_message',
 ]
 
 FloatArray = NDArray[np.float64]
@@ -229,6 +229,16 @@ def odometry_message(make: MessageFactory, window: FrameWindow) -> Any:
                   covariance=pose_covariance.reshape(-1)),
         twist=make('geometry_msgs/msg/TwistWithCovariance', twist=twist,
                    covariance=twist_covariance.reshape(-1)))
+
+
+def track_message(make: MessageFactory, stamp: int, rotation: FloatArray,
+                  position: FloatArray) -> Any:
+    """Make the nav_msgs/Odometry of base_link in the map, which is in `odom`; covariance and
+    twist are unknown.
+    """
+    return make('nav_msgs/msg/Odometry', header=header(make, FrameKey(stamp, 'odom')),
+                child_frame_id='base_link', pose=make(
+                    'geometry_msgs/msg/PoseWithCovariance', pose=_pose(make, position, rotation)))
 
 
 # Depth

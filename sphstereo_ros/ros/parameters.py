@@ -22,6 +22,7 @@ NODE_PARAMETERS: dict[str, tuple[str, ...]] = {
     'obstacle_detection': ('obstacles.', 'camera.', 'range.'),
     'pipeline': ('camera.', 'baseline.', 'pairing.', 'pose.', 'alignment.', 'calibration.',
                  'stereo.', 'range.', 'points.', 'obstacles.'),
+    'mapping': ('mapping.', 'camera.', 'baseline.', 'pairing.'),
     'bag_replay': ('replay.',),
 }
 # Names that ROS itself declares on a node.
