@@ -80,6 +80,7 @@ class Feed:
         self._depth = self._client.heard(Image, 'depth/image', NODE)
         self._sigma = self._client.heard(Image, 'depth/sigma', NODE)
         self._imu = self._client.publisher(Imu, 'imu')
+        self._settled = 0
         # The node hears a sample once it tells that it cannot use one.
         bad = Imu()
         bad.angular_velocity_covariance[0] = -1.0
@@ -88,11 +89,17 @@ class Feed:
         self._client.node.destroy_timer(probe)
 
     def level(self, *stamps: int) -> None:
-        for stamp in stamps:
-            self.roll(stamp, 0.0)
+        self.roll(*((stamp, 0.0) for stamp in stamps))
 
-    def roll(self, stamp: int, roll: float) -> None:
-        self._imu.publish(imu(stamp, roll))
+    def roll(self, *samples: tuple[int, float]) -> None:
+        """Samples of stamp and roll, which the node has on return: depth cannot overtake them."""
+        for sample in samples:
+            self._imu.publish(imu(*sample))
+        last = imu(STEP)
+        last.angular_velocity.x = math.nan
+        self._imu.publish(last)
+        self._settled += 1
+        self._client.dropped(NODE, 'imu_not_finite', self._settled)
 
     def depth(self, stamp: int, depth: np.ndarray, sigma: np.ndarray | None = None) -> None:
         self._depth.publish(floats(stamp, depth))
@@ -109,8 +116,7 @@ def test_what_is_on_the_left_is_told_on_the_left(ros: Graph) -> None:
             client.subscribe(kind, topic)
         feed = Feed(ros)
         depth, sigma = column_on_the_left()
-        for stamp, roll in ((9 * STEP, 0.0), (11 * STEP, 0.2)):
-            feed.roll(stamp, roll)
+        feed.roll((9 * STEP, 0.0), (11 * STEP, 0.2))
         feed.depth(10 * STEP, depth, sigma)
         scan = client.stamped('obstacles/scan', 10 * STEP)
         expected = ObstacleDetection(resolve({'obstacles.hidden_width': 0.0})).process(
@@ -201,6 +207,11 @@ def test_pipeline_hands_depth_on_and_tells_metres_alone(ros: Graph) -> None:
         client.subscribe(LaserScan, 'obstacles/scan')
         client.linked('obstacles/scan')
         motion = client.publisher(Odometry, 'odometry', 2)
+        probe = client.node.create_timer(
+            0.1, lambda: motion.publish(odometry(STEP, math.nan)))
+        for part in 'frame_pairing', 'obstacle_detection':
+            client.dropped(f'pipeline: {part}', 'odometry_not_finite')
+        client.node.destroy_timer(probe)
         image = client.heard(Image, 'image', 'pipeline: frame_pairing')
         frames = list(room.forward(4, 0.15, ROWS))
         for i, frame in enumerate(frames):
