@@ -46,6 +46,22 @@ def test_flow_counts_what_is_inside_the_window() -> None:
     assert flow(sent, {DEPTH: [], CLOUD: []}, (0, MS))['depth_latency_ms']['p50'] is None
 
 
+def test_frames_without_depth_are_counted_once_they_had_time() -> None:
+    sent = [k * 500 * MS for k in range(8)]
+    depth = [(stamp, stamp + 900 * MS) for stamp in sent if stamp not in (sent[1], sent[2])]
+    result = flow(sent, {DEPTH: depth, CLOUD: []}, (sent[1], sent[7]))
+    # Of the last second nothing is held against the nodes.
+    assert (result['sent'], result['without_depth']) == (6, 2)
+    assert flow(sent, {DEPTH: depth[:1], CLOUD: []}, (0, sent[7]))['without_depth'] == 4
+
+
+def test_cpu_is_that_of_the_nodes_alone() -> None:
+    result = {'seconds': 10.0, 'depth_out': 50, 'processes': {
+        'camera': {'cpu_percent': 90.0}, 'a': {'cpu_percent': 30.0}, 'b': {'cpu_percent': 20.0}}}
+    assert live.cpu_per_depth(result) == 100.0
+    assert live.cpu_per_depth({**result, 'depth_out': 0}) is None
+
+
 def test_numbers_are_those_of_the_values() -> None:
     assert numbers(list(range(100))) == {'p50': 50, 'p95': 95}
     assert numbers([3.14159], 2) == {'p50': 3.14, 'p95': 3.14}
@@ -222,11 +238,42 @@ def test_camera_leaves_late_frames_out() -> None:
     import rclpy
     rclpy.init(domain_id=99)
     try:
-        sent = camera.play(publisher, [bytearray(16)], 100.0)
+        sent = camera.play([(publisher, [bytearray(16)])], 100.0)
     finally:
         rclpy.shutdown()
     assert sent == publisher.stamps[:4]
     assert min(np.diff(publisher.stamps)) >= 19 * MS
+
+
+def test_two_cameras_send_apart() -> None:
+    pytest.importorskip('rclpy')
+    import rclpy
+
+    from sphstereo_ros.bench import camera
+    sent: list[tuple[str, int]] = []
+
+    class Publisher:
+        """Notes what it sends; Ctrl-C after four pairs."""
+
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def publish(self, data: bytes) -> None:
+            sec, nanosec = np.frombuffer(data, '<u4', 2, 4)
+            sent.append((self.name, int(sec) * 10**9 + int(nanosec)))
+            if len(sent) == 8:
+                raise KeyboardInterrupt
+    rclpy.init(domain_id=99)
+    try:
+        wanted = iter([0.02, -0.01, 0.02, -0.01])
+        stamps = camera.play([(Publisher('bottom'), [bytearray(16)]),
+                              (Publisher('top'), [bytearray(16)])], 20.0, lambda: next(wanted))
+    finally:
+        rclpy.shutdown()
+    assert [name for name, _ in sent] == 2 * ['bottom', 'top', 'top', 'bottom']
+    assert stamps == [stamp for name, stamp in sent if name == 'bottom'][:len(stamps)]
+    gaps = np.diff([stamp for _, stamp in sent])[::2]
+    assert (gaps >= np.array([20, 10, 20, 10]) * MS).all()
 
 
 def test_demonstration_scores_what_came_against_the_truth() -> None:
@@ -248,8 +295,12 @@ def test_demonstration_scores_what_came_against_the_truth() -> None:
     assert demo.score({}, {}) == {'frames': 0}
 
 
-@pytest.mark.parametrize('wrong', ['--rate 0', '--height 10', '--seconds 0',
-                                   '-p no.such:=1'])
+TWO = '-p pairing.mode:=binocular'
+
+
+@pytest.mark.parametrize('wrong', ['--rate 0', '--height 10', '--seconds 0', '-p no.such:=1',
+                                   '--apart 5', f'{TWO} --apart 60 --jitter 7',
+                                   f'{TWO} --jitter -1'])
 def test_bad_options_are_refused_before_anything_starts(
         wrong: str, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip('rclpy')
@@ -257,7 +308,7 @@ def test_bad_options_are_refused_before_anything_starts(
     parser = argparse.ArgumentParser()
     parser.add_argument('--json', action='store_true')
     live.add_arguments(parser)
-    with pytest.raises(ValueError, match=r'--rate|no\.such'):
+    with pytest.raises(ValueError, match=r'--rate|no\.such|--apart'):
         live.main(parser.parse_args(wrong.split()))
 
 
@@ -283,6 +334,33 @@ def test_live_bench_measures_the_nodes() -> None:
     assert result['restart']['node'] == 'pipeline'
     assert math.isfinite(result['restart']['subscribed_to_depth_s'])
     assert result['exit_statuses'] == {'pipeline': 0}
+
+
+def test_live_bench_measures_two_cameras() -> None:
+    pytest.importorskip('rclpy')
+    pair = SAMPLE.with_name('binocular.mcap')
+    if not pair.exists():
+        pytest.skip('no sample bag')
+    known = [f'camera.top.{axis}:={np.radians(angle)}'
+             for axis, angle in (('roll', 2.0), ('pitch', -1.5), ('yaw', 3.0))]
+    done = subprocess.run(
+        [sys.executable, '-m', 'sphstereo_ros.cli', 'bench', 'live', '--bag', str(pair),
+         '--height', '240', '--rate', '4', '--seconds', '3', '--chain', 'pipeline', '--json',
+         '--apart', '20', '--jitter', '4', '--no-obstacles', '--no-restart',
+         '--params', str(SAMPLE.parents[1] / 'config' / 'binocular_live.yaml'),
+         *(word for name in (*known, 'stereo.working_height:=240', 'calibration.pairs:=0')
+           for word in ('-p', name))],
+        stdout=subprocess.PIPE, timeout=120, check=True)
+    *table, line = done.stdout.decode().splitlines()
+    result = json.loads(line)
+    assert result['cameras'] == 2
+    assert 11 <= result['sent'] <= 13
+    assert 0 < result['depth_out'] <= 14
+    pairing = result['stages']['pipeline: frame_pairing']
+    # Both cameras' frames, but for one under way at either end.
+    assert abs(pairing['frames_in'] - 2 * pairing['frames_out']) <= 4
+    assert result['cpu_ms_per_depth'] > 1
+    assert table[0].startswith('pipeline: pairs of 480×240 mono8, stamps 20 ± 4 ms apart')
 
 
 def test_the_table_of_the_demonstration_has_the_bands() -> None:

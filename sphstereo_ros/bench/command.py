@@ -198,7 +198,8 @@ def _speed(args: argparse.Namespace) -> dict[str, Any]:
     from .live import frames
     from .processes import shipped
     from .speed import measure, one_reference, stage_times, window_cost
-    images = frames(args.input or shipped('bags/street.mcap'), args.height, colour=False)
+    images = frames(args.input or shipped('bags/street.mcap'), args.height,
+                    colour=False)['camera']
     own = load_values(args.params, args.overrides)
     given = one_reference({'stereo.matcher': 'bm', **own})
     stages = stage_times(images, given)

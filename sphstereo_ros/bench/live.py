@@ -1,4 +1,7 @@
-"""The live benchmark: the nodes as processes, frames through DDS at a given rate."""
+"""The live benchmark: the nodes as processes, frames through DDS at a given rate.
+
+With `pairing.mode` binocular there are two cameras, and every frame of the bottom one is a pair.
+"""
 from __future__ import annotations
 
 import argparse
@@ -21,7 +24,7 @@ from sphstereo_ros.core.frames import Drop
 from sphstereo_ros.mavlink.encoding import MissingLibraryError
 from sphstereo_ros.replay.parameter_files import load_config
 from sphstereo_ros.replay.records import BadInput
-from sphstereo_ros.replay.sources import image_topic, open_source
+from sphstereo_ros.replay.sources import IMAGE_TOPICS, STEREO_TOPICS, image_topics, open_source
 from sphstereo_ros.ros.conversions import decode_frame
 
 from .autopilot import Autopilot
@@ -31,16 +34,23 @@ from .speed import to_and_fro
 DEPTH, CLOUD, MAVLINK = '/depth/image', '/points', 'OBSTACLE_DISTANCE'
 START_UP = 120.0  # seconds until the first depth
 SETTLE = 3.0
-RESTARTED = {'separate': ('pose_stabilisation', ('/pairs', '/frames')),
-             'pipeline': ('pipeline', ('/image', '/image/compressed'))}
+RESTARTED = {'separate': 'pose_stabilisation', 'pipeline': 'pipeline'}
+# Metres between the frames of the sample, and between the cameras of the sample of two.
+_STEP, _APART = 0.28, 0.35
+_SECOND = 1_000_000_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `sphstereo bench live`, --json apart."""
-    parser.add_argument('--bag', type=Path, default=Path('bags/street.mcap'), metavar='IN',
-                        help='frames to send, forth and back (default: %(default)s)')
+    parser.add_argument('--bag', type=Path, metavar='IN', help='frames to send, forth and back '
+                        '(default: bags/street.mcap, of two cameras bags/binocular.mcap)')
     parser.add_argument('--height', type=int, default=480, help='rows of the frames sent')
-    parser.add_argument('--rate', type=float, default=30.0, metavar='HZ')
+    parser.add_argument('--rate', type=float, metavar='HZ',
+                        help='(default: 30, of two cameras 15)')
+    parser.add_argument('--apart', type=float, default=0.0, metavar='MS', help='two cameras: the '
+                        'top one sends so much later, and stamps so')
+    parser.add_argument('--jitter', type=float, default=0.0, metavar='MS',
+                        help='two cameras: by how much that varies, either way')
     parser.add_argument('--seconds', type=float, default=30.0, help='to be measured')
     parser.add_argument('--encoding', choices=('mono8', 'bgr8', 'jpeg'), default='mono8')
     parser.add_argument('--chain', choices=tuple(CHAINS), default='separate',
@@ -60,39 +70,57 @@ def main(args: argparse.Namespace) -> int:
         import rclpy  # noqa: F401
     except ImportError as error:
         raise BadInput(f'bench live needs ROS 2, and there is no {error.name}') from error
+    files = args.params or [shipped('config/live.yaml')]
+    config = load_config(files, args.overrides)  # refused here rather than by each node
+    binocular = config.pairing.mode == 'binocular'
+    if args.rate is None:
+        args.rate = 15.0 if binocular else 30.0
+    if args.bag is None:
+        args.bag = shipped('bags/binocular.mcap' if binocular else 'bags/street.mcap')
     if args.height < 60 or not args.rate > 0 or not args.seconds >= 1:
         raise BadInput('--height: at least 60; --rate: above 0; --seconds: at least 1')
-    files = args.params or [shipped('config/live.yaml')]
-    load_config(files, args.overrides)  # refused here rather than by each node
-    result = _run(args, node_arguments(files, args.overrides))
+    if not 0 <= args.jitter <= abs(args.apart) + args.jitter < 1e3 / args.rate:
+        raise BadInput('--apart, --jitter: together less than the time between frames')
+    if (args.apart or args.jitter) and not binocular:
+        raise BadInput('--apart, --jitter: there is one camera (pairing.mode)')
+    result = _run(args, node_arguments(files, args.overrides, _APART if binocular else _STEP),
+                  binocular)
     print(table(result))
     if args.json:
         print(json.dumps(result))
     return 0
 
 
-def node_arguments(files: Sequence[Path], overrides: Sequence[str]) -> list[str]:
+def node_arguments(files: Sequence[Path], overrides: Sequence[str],
+                   baseline: float = _STEP) -> list[str]:
     """ROS arguments of a node, with the sample's baseline unless another is given."""
     words = [word for file in files for word in ('--params-file', str(file))]
     given = [o.partition(':=')[0] for o in overrides]
     if not any(name.startswith('baseline.') for name in given):
-        overrides = ['baseline.length:=0.28', *overrides]
+        overrides = [f'baseline.length:={baseline}', *overrides]
     return [*words, *(word for o in overrides for word in ('-p', o))]
 
 
-def frames(path: Path, height: int, colour: bool) -> NDArray[np.uint8]:
-    """All images of an input, (N, H, 2H) grey or (N, H, 2H, 3) BGR, forth and back."""
+def frames(path: Path, height: int, colour: bool,
+           binocular: bool = False) -> dict[str, NDArray[np.uint8]]:
+    """All images of an input, forth and back: (N, H, 2H) grey or (N, H, 2H, 3) BGR, by camera:
+    `camera`, or `bottom` and `top`.
+    """
     source = open_source(path)
-    read = []
-    for record in source.records([image_topic(source)]):
+    sides = image_topics(source, binocular)
+    read: dict[str, list[NDArray[np.uint8]]] = {side or 'camera': [] for side in sides.values()}
+    for record in source.records(list(sides)):
         message = record.message()
         frame = message if isinstance(message, Drop) else decode_frame(message, 0, colour)
         if not isinstance(frame, Drop):
             image = frame.image if frame.colour is None else frame.colour
-            read.append(cv2.resize(image, (2 * height, height), interpolation=cv2.INTER_AREA))
-    if len(read) < 2:
+            read[sides[record.topic] or 'camera'].append(
+                cv2.resize(image, (2 * height, height), interpolation=cv2.INTER_AREA))
+    count = min(len(images) for images in read.values())
+    if count < 2:
         raise BadInput(f'{path}: less than two frames')
-    return np.stack(to_and_fro(read, 2 * len(read) - 2))
+    return {name: np.stack(to_and_fro(read[name][:count], 2 * count - 2))
+            for name in sorted(read)}
 
 
 @dataclass
@@ -116,11 +144,13 @@ class Usage:
                                      / max(self.seconds[-1] - self.seconds[0], 1e-3), 1)}
 
 
-def _run(args: argparse.Namespace, parameters: list[str]) -> dict[str, Any]:
+def _run(args: argparse.Namespace, parameters: list[str], binocular: bool) -> dict[str, Any]:
     from .observer import Observer
-    with tempfile.TemporaryDirectory() as name, ExitStack() as open_ones:
-        folder = Path(name)
-        np.save(folder / 'frames.npy', frames(args.bag, args.height, args.encoding != 'mono8'))
+    with tempfile.TemporaryDirectory() as place, ExitStack() as open_ones:
+        folder = Path(place)
+        cameras = frames(args.bag, args.height, args.encoding != 'mono8', binocular)
+        for name, images in cameras.items():
+            np.save(folder / f'{name}.npy', images)
         private_domain()
         arrivals: dict[str, list[tuple[int, int]]] = {}
         if not args.no_obstacles:
@@ -137,20 +167,33 @@ def _run(args: argparse.Namespace, parameters: list[str]) -> dict[str, Any]:
             if not args.no_obstacles and args.chain == 'separate':
                 processes.start('obstacle_detection', '--ros-args', *parameters)
             processes.start('camera', sys.executable, '-m', 'sphstereo_ros.bench.camera',
-                            str(folder / 'frames.npy'), '--rate', str(args.rate),
-                            '--encoding', args.encoding, '--sent', str(folder / 'sent.json'))
+                            *(str(folder / f'{name}.npy') for name in cameras),
+                            '--rate', str(args.rate), '--apart', str(args.apart),
+                            '--jitter', str(args.jitter), '--encoding', args.encoding,
+                            '--sent', str(folder / 'sent.json'))
             bench = LiveBench(observer, processes)
             first = bench.start_up()
             window, usage, drops = bench.measure(args.seconds)
-            restart = None if args.no_restart else bench.restart(args.chain, parameters)
+            restart = None if args.no_restart else bench.restart(
+                args.chain, parameters, inputs(args.chain, binocular))
             processes.stop('camera')
             sent = json.loads((folder / 'sent.json').read_text())
             statuses = processes.stop(*processes.running)
-    return {'chain': args.chain, 'height': args.height, 'encoding': args.encoding,
-            'rate_wanted': args.rate, 'seconds': args.seconds,
-            **flow(sent, arrivals, window),
-            'stages': drops, 'processes': usage, 'first_depth_s': first, 'restart': restart,
-            'exit_statuses': statuses}
+    result = {'chain': args.chain, 'cameras': len(cameras), 'height': args.height,
+              'encoding': args.encoding, 'apart_ms': args.apart, 'jitter_ms': args.jitter,
+              'rate_wanted': args.rate, 'seconds': args.seconds, **flow(sent, arrivals, window),
+              'stages': drops, 'processes': usage, 'first_depth_s': first, 'restart': restart,
+              'exit_statuses': statuses}
+    return {**result, 'cpu_ms_per_depth': cpu_per_depth(result)}
+
+
+def cpu_per_depth(result: dict[str, Any]) -> float | None:
+    """Milliseconds of CPU that all nodes together need for a range image."""
+    if not result['depth_out']:
+        return None
+    used = sum(usage['cpu_percent'] for name, usage in result['processes'].items()
+               if name != 'camera')
+    return float(round(10 * used * result['seconds'] / result['depth_out'], 1))
 
 
 def _autopilot() -> Autopilot:
@@ -201,9 +244,10 @@ class LiveBench:
         return (window, {name: usage.summary() for name, usage in used.items()},
                 since(before, self._observer.totals()))
 
-    def restart(self, chain: str, parameters: list[str]) -> dict[str, Any]:
-        """Kill a node, start it again, and wait for depth."""
-        name, topics = RESTARTED[chain]
+    def restart(self, chain: str, parameters: list[str],
+                topics: Sequence[str]) -> dict[str, Any]:
+        """Kill a node, start it again, and wait for depth; `topics` are those it takes."""
+        name = RESTARTED[chain]
         known = {topic: self._observer.subscriptions(topic, name) for topic in topics}
         self._processes.kill(name)
         self._observer.spin(1.0)
@@ -224,6 +268,13 @@ class LiveBench:
                 'subscribed_to_depth_s': round((depth[so_far][1] - subscribed) / 1e9, 2)}
 
 
+def inputs(chain: str, binocular: bool) -> tuple[str, ...]:
+    """What the node that is restarted subscribes to."""
+    if chain == 'separate':
+        return '/pairs', '/frames'
+    return tuple(STEREO_TOPICS if binocular else IMAGE_TOPICS)
+
+
 def last_lines(process: Process) -> str:
     """What a process wrote last, for a message."""
     return ' / '.join(process.log.read_text(errors='replace').splitlines()[-3:])
@@ -231,11 +282,18 @@ def last_lines(process: Process) -> str:
 
 def flow(sent: Sequence[int], arrivals: dict[str, list[tuple[int, int]]],
          window: tuple[int, int]) -> dict[str, Any]:
-    """Rates and latencies of what was sent and arrived within a window of time (ns)."""
+    """Rates and latencies of what was sent and arrived within a window of time (ns).
+
+    sent : stamps of the frames, with two cameras of the bottom one's; `without_depth` are those of
+    which no range image ever came, but for the last second's
+    """
     begin, end = window
     seconds = (end - begin) / 1e9
     inside = [stamp for stamp in sent if begin <= stamp < end]
-    out: dict[str, Any] = {'sent': len(inside), 'rate_in': round(len(inside) / seconds, 2)}
+    came = {stamp for stamp, _ in arrivals[DEPTH]}
+    out: dict[str, Any] = {
+        'sent': len(inside), 'rate_in': round(len(inside) / seconds, 2),
+        'without_depth': sum(stamp not in came for stamp in inside if stamp < end - _SECOND)}
     for topic, name in ((DEPTH, 'depth'), (CLOUD, 'cloud'), (MAVLINK, 'mavlink')):
         if topic not in arrivals:
             continue
@@ -248,9 +306,13 @@ def flow(sent: Sequence[int], arrivals: dict[str, list[tuple[int, int]]],
 
 def table(result: dict[str, Any]) -> str:
     """The result for people."""
-    lines = [f'{result["chain"]}: {2 * result["height"]}×{result["height"]} {result["encoding"]}, '
+    pairs = result['cameras'] == 2
+    stamps = f', stamps {result["apart_ms"]:g} ± {result["jitter_ms"]:g} ms apart' if pairs else ''
+    lines = [f'{result["chain"]}: {"pairs of " if pairs else ""}'
+             f'{2 * result["height"]}×{result["height"]} {result["encoding"]}{stamps}, '
              f'{result["rate_wanted"]:g} Hz wanted, {result["seconds"]:g} s',
-             f'sent          {result["sent"]:6}  {result["rate_in"]:6.1f} Hz']
+             f'{"pairs sent" if pairs else "sent":12}  {result["sent"]:6}  '
+             f'{result["rate_in"]:6.1f} Hz   {result["without_depth"]} of them without depth']
     for name in ('depth', 'cloud', 'mavlink'):
         if f'{name}_out' not in result:
             continue
@@ -268,6 +330,7 @@ def table(result: dict[str, Any]) -> str:
         start, end = usage['memory_start_mb'], usage['memory_end_mb']
         lines.append(f'  {name:34}{start:8.1f} →{end:7.1f} MB'
                      f' ({usage["growth_mb_per_min"]} MB/min)  {usage["cpu_percent"]:.0f} % CPU')
+    lines.append(f'CPU of the nodes for a range image: {result["cpu_ms_per_depth"]} ms')
     lines.append(f'first depth {result["first_depth_s"]} s after the start')
     if result['restart']:
         back = result['restart']

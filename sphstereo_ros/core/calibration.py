@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -335,7 +336,7 @@ class AlignmentCalibration:
             far = points[moved <= max(float(np.median(moved)), 1e-6)]
         out = []
         for centre in (prior, turn):
-            near = np.array([rotations.exp(step) @ centre for step in _STEPS])
+            near = _turns() @ centre
             out.append((best_rotation(near, self._direction, points, _STEP), self._direction))
         found = ransac(points, self.config.pose.inlier_threshold,
                        np.random.default_rng(self.config.pose.seed))
@@ -435,6 +436,12 @@ class AlignmentCalibration:
             floor[:3, :3] = _TILT**2 * lean * across
         floor[:3, :3] += turn * np.eye(3)
         return covariance + floor
+
+
+@cache
+def _turns() -> Floats:
+    """The rotations of `_STEPS`, (N, 3, 3)."""
+    return np.array([rotations.exp(step) for step in _STEPS])
 
 
 def _most_frequent(drops: list[Drop]) -> Drop:
