@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 
 SUFFIXES = ('.ply', '.pcd', '.las')
 _LAS_STEP = 1e-4  # m
-_LIBRARIES = {'.ply': 'plyfile', '.pcd': 'pypcd4', '.las': 'laspy'}
+_LIBRARIES = {'.ply': 'trimesh', '.pcd': 'pypcd4', '.las': 'laspy'}
 
 
 def written_whole(path: Path, write: Callable[[Path], object]) -> None:
@@ -132,8 +132,9 @@ def _write_las(path: Path, cloud: PointCloud) -> None:
 
 
 def _read_ply(library: Any, path: Path) -> PointCloud:
-    vertex = library.PlyData.read(path)['vertex']
-    names = vertex.data.dtype.names
+    raw = library.load(path, file_type='ply').metadata['_ply_raw']
+    vertex = raw['vertex']['data']
+    names = vertex.dtype.names
     colours = [vertex[c] for c in ('blue', 'green', 'red')] if 'red' in names else None
     return _cloud([vertex[a] for a in 'xyz'], vertex['sigma'] if 'sigma' in names else None,
                   colours)
