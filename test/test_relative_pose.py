@@ -22,6 +22,7 @@ from sphstereo_ros.core.frames import Drop, RelativePose
 from sphstereo_ros.core.relative_pose import (
     Correspondences,
     PoseEstimate,
+    cells_of,
     epipolar_residuals,
     in_front,
     parallax,
@@ -29,6 +30,7 @@ from sphstereo_ros.core.relative_pose import (
     refine,
     rotation_between,
     tangent,
+    weighted_by_neighbours,
 )
 from sphstereo_ros.core.stabilisation import estimate, with_length
 
@@ -202,6 +204,32 @@ def test_covariance_is_that_of_repeated_estimates(motion):
     squared = [e @ np.linalg.solve(p.covariance, e) for e, p in zip(errors, poses, strict=True)]
     assert 0.5 * 5 < np.mean(squared) < 1.6 * 5
     assert np.mean([p.residual for p in poses]) == pytest.approx(1e-3 * np.sqrt(2), rel=0.3)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_neighbours_that_contradict_count_less(seed):
+    """What is matched in one place errs across the meridians, too little to be an outlier."""
+    rng = np.random.default_rng(seed)
+    rotation, position = random_rotation(rng, 0.02), unit([0.1, 0.0, -1.0])
+    points = correspondences(rng, 1500, rotation, position, noise=1e-4)
+    longitude = np.arctan2(points.current[:, 1], points.current[:, 0])
+    cells = cells_of(np.stack([longitude + np.pi, points.current[:, 2] + 1], axis=1), 1)
+    slipping = cells == 3
+    across = unit(np.cross(position, points.current))
+    slipped = unit(points.current + 4e-4 * slipping[:, None] * across)
+    points = Correspondences(points.reference, slipped, points.sigma)
+    first = refine(rotation, position, points)
+    weighted = weighted_by_neighbours(points, cells, first)
+    assert weighted.sigma[slipping].min() > 1.5 * weighted.sigma[~slipping].max()
+    second = refine(first.rotation, first.direction, weighted)
+    assert rotation_error(second.rotation, rotation) < 0.5 * rotation_error(first.rotation,
+                                                                            rotation)
+
+
+def test_cells_are_squares():
+    pixels = np.array([[0, 0], [9.9, 0], [10, 0], [0, 10], [35, 10]], np.float32)
+    assert cells_of(pixels, 10).tolist() == [0, 0, 1, 4, 7]
+    assert cells_of(np.zeros((0, 2), np.float32), 10).tolist() == []
 
 
 def test_covariance_of_six_has_no_share_along_the_direction():

@@ -27,13 +27,21 @@ from .frames import (
 from .history import PoseHistory, with_baseline
 from .paper import window_ratio_direction
 from .photometric import matched
-from .relative_pose import Correspondences, PoseEstimate, epipolar_residuals, refine
+from .relative_pose import (
+    Correspondences,
+    PoseEstimate,
+    cells_of,
+    epipolar_residuals,
+    refine,
+    weighted_by_neighbours,
+)
 from .stabilisation import reduced, with_length
 from .warp import PolarGrid
 
 Floats = NDArray[np.float64]
 
 _MARGIN, _WRAP = 8, 8
+_CELLS = 14  # of the grid's height: within one, neighbours judge each other
 # By how much a length may differ from the one believed before the reference is followed anew, and
 # how uncertain it may be, as a share of it.
 _SURPRISE, _UNSURE = 0.03, 0.01
@@ -128,12 +136,10 @@ class Aligner:
 
     def _nearest(self, current: Image8, reference: Reference,
                  grid: PolarGrid) -> tuple[CurrentView, RelativePose] | Drop:
-        """Refine on the grid about the reference's own direction."""
+        """Refine on the grid about the reference's own direction; again by the ranges found."""
         pose = reference.pose
         view = current_view(current, pose.direction, grid, self.config.max_points)
-        for iteration in range(self.config.iterations):
-            if iteration:
-                view = current_view(current, pose.direction, grid, self.config.max_points)
+        for _ in range(self.config.iterations):
             found = self._fitted(view, reference, pose)
             if isinstance(found, Drop):
                 return found
@@ -197,7 +203,8 @@ class Aligner:
         points, index = followed(view, self._reduced(reference.frame.image), pose)
         keep = self._beside_mask(points)
         points, index = points[keep], index[keep]
-        estimate = self._refined(points, pose, view.grid.pixel)
+        cells = cells_of(view.points[index], view.grid.height // _CELLS)
+        estimate = self._refined(points, cells, pose, view.grid.pixel)
         if isinstance(estimate, Drop):
             return estimate
         return points[estimate.inliers], index[estimate.inliers], estimate
@@ -214,11 +221,14 @@ class Aligner:
         return keep
 
     @staticmethod
-    def _refined(points: Correspondences, pose: RelativePose,
+    def _refined(points: Correspondences, cells: NDArray[np.intp], pose: RelativePose,
                  threshold: float) -> PoseEstimate | Drop:
         if len(points) < 100:
             return Drop('alignment_failed', f'{len(points)} points with texture')
         refined = refine(pose.rotation, -pose.direction, points)
+        if refined is not None:
+            refined = refine(refined.rotation, refined.direction,
+                             weighted_by_neighbours(points, cells, refined))
         if refined is None:
             return Drop('alignment_failed', 'the aligned pair fixes no motion')
         # The robust loss adapts to any residuals, so inliers are counted by the threshold.

@@ -19,6 +19,9 @@ Floats = NDArray[np.float64]
 
 _TUKEY = 4.685
 _SMALL_STEP = 1e-6  # rad, after which refinement stops
+# Neighbours: residuals count up to so many medians; their mean is so many medians as a rule, which
+# so many points more are taken to have; how strongly it counts; how much alike neighbours err.
+_MOST, _USUAL, _FEW, _TRUST, _ALIKE = 3.0, 1.1, 4, 3, 0.1
 
 
 @dataclass(frozen=True)
@@ -263,6 +266,36 @@ def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iter
     covariance[:len(normal), :len(normal)] = np.linalg.inv(normal) * scale**2
     return PoseEstimate(rotation, direction, inliers, covariance,
                         scale * float(np.median(points.sigma)))
+
+
+def cells_of(pixels: NDArray[np.floating], size: int) -> NDArray[np.intp]:
+    """The square cell of `size` px in which each position (N, 2) lies: (N,); none is negative."""
+    column, row = (np.asarray(pixels) // size).astype(np.intp).T
+    return np.asarray(row * (column.max(initial=0) + 1) + column)
+
+
+def weighted_by_neighbours(points: Correspondences, cells: NDArray[np.intp],
+                           estimate: PoseEstimate) -> Correspondences:
+    """The points with a larger sigma where those around them contradict the estimate.
+
+    What glides over glossy ground, or is matched at rims, misleads many points in one place, each
+    by too little to be an outlier. And neighbours err alike: ten tell less than ten times as much
+    as one.
+
+    Parameters
+    ----------
+    points : (N,) correspondences
+    cells : (N,) which cell of the image each lies in, from 0
+    estimate : a first estimate from them
+
+    """
+    residual = epipolar_residuals(estimate.rotation, estimate.direction, points) / points.sigma
+    size = np.abs(residual)
+    size = np.minimum(size / max(float(np.median(size)), 1e-12), _MOST)
+    count = np.bincount(cells)
+    mean = (np.bincount(cells, size) / _USUAL + _FEW) / (count + _FEW)
+    share = np.maximum(mean, 1)**_TRUST * np.sqrt(1 + _ALIKE * (count - 1))
+    return Correspondences(points.reference, points.current, points.sigma * share[cells])
 
 
 def warm_up() -> None:
