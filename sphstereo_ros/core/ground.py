@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .jit import kernel
+from .jit import fast_kernel, kernel
 
 Floats = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -58,9 +58,7 @@ def find_ground(points: Plane, camera: Floats) -> Ground | None:
     planes = _candidates(chosen, camera)
     if not len(planes):
         return None
-    off = np.abs(planes[:, :1] * x + planes[:, 1:2] * y + planes[:, 2:] - z) / tolerance
-    score = np.clip(1 - off**2, 0, None) @ weight
-    best = planes[int(np.argmax(score))]
+    best = planes[int(np.argmax(_scores(planes, chosen, tolerance, weight)))]
     for _ in range(3):
         off = np.abs(best[0] * x + best[1] * y + best[2] - z) / tolerance
         w = weight * np.clip(1 - off**2, 0, None)
@@ -70,6 +68,18 @@ def find_ground(points: Plane, camera: Floats) -> Ground | None:
         normal = design.T @ (w[:, None] * design)
         best = np.linalg.solve(normal + 1e-9 * np.eye(3), design.T @ (w * z))
     return None if _impossible(best[None], camera)[0] else Ground((best[0], best[1]), best[2])
+
+
+@fast_kernel
+def _scores(planes: Floats, points: Floats, tolerance: Floats,
+            weight: Floats) -> Floats:  # pragma: no cover - compiled
+    out = np.zeros(len(planes))
+    for k in range(len(planes)):
+        for i in range(len(points)):
+            off = (planes[k, 0] * points[i, 0] + planes[k, 1] * points[i, 1] + planes[k, 2]
+                   - points[i, 2]) / tolerance[i]
+            out[k] += weight[i] * max(1 - off * off, 0.0)
+    return out
 
 
 def _impossible(planes: Floats, camera: Floats) -> NDArray[np.bool_]:
@@ -101,12 +111,12 @@ def _spread_out(points: Plane, camera: Floats) -> tuple[Floats | None, Floats]:
                     * (_RINGS / math.log(_FARTHEST / _NEAREST)))
     wedge = np.floor((np.arctan2(y, x) / (2 * np.pi) + 0.5) * _WEDGES) % _WEDGES
     inside = (ring >= 0) & (ring < _RINGS)
-    cell = (ring * _WEDGES + wedge)[inside].astype(np.intp)
+    cell = (ring * _WEDGES + wedge)[inside].astype(np.int16)  # small, so quick to sort
     if cell.size < _LEAST_CELLS:
         return None, np.empty(0)
     order = np.argsort(cell, kind='stable')
-    cell = cell[order]
-    _, first, count = np.unique(cell, return_index=True, return_counts=True)
+    first = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    count = np.diff(first, append=cell.size)
     share = (np.arange(_PER_CELL) + 0.5) / _PER_CELL
     picked = first[:, None] + (share * count[:, None]).astype(np.intp)
     weight = np.full(picked.size, 1.0 / _PER_CELL)

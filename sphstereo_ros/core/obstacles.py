@@ -24,7 +24,7 @@ from .level import Attitude
 from .open_space import STEEPEST, Hidden, distances_asked, hiding_place
 from .rotations import mount
 from .sectors import SECTORS, ObstacleSectors, SectorState
-from .survey import Band, survey
+from .survey import Band, points_of, survey
 from .warp import Map
 
 Floats = NDArray[np.float64]
@@ -123,14 +123,11 @@ class _Picture:
 
     def _points(self, believed: NDArray[np.bool_]) -> Map:
         step = max(1, len(believed) // (2 * _SAMPLED_ROWS))
-        i, j = np.nonzero(believed[::step, ::step])
-        (cos_lat, sin_lat), (cos_lon, sin_lon) = (
-            angles[k * step].T for angles, k in zip(self._angles, (i, j), strict=True))
-        rays = np.stack([cos_lat * sin_lon, -sin_lat, cos_lat * cos_lon], axis=1)
-        r = self._image.range[i * step, j * step]
-        r = np.where(np.isfinite(r), r, np.float32(self._config.range.minimum))
-        return np.asarray(r[:, None] * (rays @ self._turn.T)
-                          + self._camera.astype(np.float32), np.float32)
+        points = np.empty((believed[::step, ::step].size, 3), np.float32)
+        count = points_of(believed, self._image.range, *self._angles, self._turn,
+                          self._camera.astype(np.float32), step, self._config.range.minimum,
+                          points)
+        return points[:count].copy()
 
     def _result(self, found: NDArray[np.int32], free: NDArray[np.bool_],
                 hidden: Floats, points: Map) -> ObstacleSectors:

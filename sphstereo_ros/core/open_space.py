@@ -68,20 +68,39 @@ def hiding_place(seen: Counts, distances: Floats, thing: Hidden, limits: Obstacl
 
 
 @kernel
-def _sums(layer: Counts, out: NDArray[np.int64]) -> None:  # pragma: no cover - compiled
-    """Summed area table (E + 1, 2C + 1) of (E, C), twice round."""
-    rows, columns = layer.shape
-    for e in range(rows):
+def _sums(layer: Counts, first: int, last: int,
+          out: NDArray[np.int64]) -> None:  # pragma: no cover - compiled
+    """Summed area table (E + 1, C + 1) of the rows first … last of (E, C)."""
+    out[first] = 0
+    for e in range(first, last):
         run = 0
-        for c in range(2 * columns):
-            run += layer[e, c if c < columns else c - columns]
+        for c in range(layer.shape[1]):
+            run += layer[e, c]
             out[e + 1, c + 1] = out[e, c + 1] + run
 
 
 @kernel
 def _within(sums: NDArray[np.int64], e0: int, e1: int, c0: int,
             c1: int) -> int:  # pragma: no cover - compiled
-    return int(sums[e1, c1] - sums[e0, c1] - sums[e1, c0] + sums[e0, c0])
+    """Of columns c0 … c1, which may go once round."""
+    columns = sums.shape[1] - 1
+    if c1 <= columns:
+        return int(sums[e1, c1] - sums[e0, c1] - sums[e1, c0] + sums[e0, c0])
+    beyond = sums[e1, c1 - columns] - sums[e0, c1 - columns]
+    return int(sums[e1, columns] - sums[e0, columns] - sums[e1, c0] + sums[e0, c0] + beyond)
+
+
+@kernel
+def _rows_asked(low: float, high: float, near: float, far: float, cell: float,
+                rows: int) -> tuple[int, int]:  # pragma: no cover - compiled
+    """The cells of elevation that things between two heights, near … far from the camera, have.
+
+    low, high : metres above the camera
+    """
+    first = min(math.atan2(low, near), math.atan2(low, far))
+    last = max(math.atan2(high, near), math.atan2(high, far))
+    return (min(max(math.floor((first + STEEPEST) / cell), 0), rows),
+            min(max(math.ceil((last + STEEPEST) / cell), 0), rows))
 
 
 @kernel
@@ -92,7 +111,7 @@ def _hides(sums: NDArray[np.int64], clear: NDArray[np.int64], angle: float, dist
 
     angle : of its middle, in columns; distance : from the camera; up : height of the camera
     """
-    rows, columns = sums.shape[0] - 1, sums.shape[1] // 2
+    rows, columns = sums.shape[0] - 1, sums.shape[1] - 1
     wide = min(max(1, round(size[0] / distance * columns / (2 * np.pi))), columns)
     c0 = math.floor(angle - 0.5 * wide + 0.5 + _ROUNDING) % columns
     tall = min(size[1], high - low)
@@ -142,20 +161,23 @@ def _hiding(seen: Counts, distances: Floats, asked: Floats, bounds: Floats, plan
             trust_sky: bool) -> NDArray[np.intp]:  # pragma: no cover - compiled
     layers, rows, columns = seen.shape
     horizon = int((STEEPEST + _SKY) / cell) + 1
-    sums = np.zeros((rows + 1, 2 * columns + 1), np.int64)
-    clear = np.zeros((rows + 1, 2 * columns + 1), np.int64)
-    farther, known = np.zeros((rows, columns), np.int32), np.zeros((rows, columns), np.int32)
+    sums, clear = np.zeros((2, rows + 1, columns + 1), np.int64)
+    known, unknown = np.zeros((rows, columns), np.int32), seen[layers - 1]
     for layer in range(layers - 1):
-        farther += seen[layer]
-    known[:] = farther
-    _sums(known + seen[layers - 1], sums)
+        known += seen[layer]
+    farther = known.copy()
+    _sums(known + unknown, 0, rows, sums)
+    aside = math.hypot(camera[0], camera[1])
     out = np.full(SECTORS, layers - 2)
     for k in range(layers - 2):
         farther -= seen[k]  # what is left is farther than distances[k]
         if distances[k] < asked[4]:
             continue
-        _sums(_with_sky(farther, known, seen[layers - 1], horizon) if trust_sky else farther,
-              clear)
+        first, last = _rows_asked(bounds[0] - camera[2], bounds[1] - camera[2],
+                                  max(distances[k] - aside, 0.05), distances[k] + aside, cell,
+                                  rows)
+        _sums(_with_sky(farther, known, unknown, horizon) if trust_sky and last > horizon
+              else farther, first, last, clear)
         size = asked[:2] * max(1.0, distances[k] / asked[2])
         for column in range(columns):
             sector = column * SECTORS // columns
