@@ -175,3 +175,51 @@ def test_misfit_tells_what_does_not_fit():
     clear = np.abs(view.theta() - 90) < 60
     assert np.median(right[clear]) < 10  # noise of one level each, and resampling
     assert np.median(wrong[clear]) > 10 * np.median(right[clear])
+
+
+UP: tuple[Vector, ...] = ((0, -0.35, 0),)
+ROOM = World(posts=())  # floor and walls slant away
+
+
+def slanted(window: int, wide: int = 0, averaged: bool = False, world: World = ROOM,
+            noise: float = 0.0) -> np.ndarray:
+    """Errors in px of one step from what is exact; noise in grey levels is added to both views."""
+    view = seen(UP, world)
+    rng = np.random.default_rng(3)
+    image, reference = (np.clip(i + rng.normal(0, noise, i.shape), 0, 255).astype(np.uint8)
+                        for i in (view.image, view.pairs[0][0]))
+    refinement = JointRefinement(image, view.grid, view.axes, changed(view, n0=reference))
+    found = refinement.refined(view.rho(), window) if averaged \
+        else refinement.levelled(view.rho(), window, wide)
+    inside = (view.theta() > 15) & (view.theta() < 165)
+    pixel = view.grid.pixel / 0.35
+    return np.abs(found.rho - view.rho())[inside] / pixel
+
+
+def test_the_slope_of_a_surface_is_no_noise():
+    assert np.median(slanted(15)) < 0.6 * np.median(slanted(15, averaged=True))
+
+
+def test_a_wide_window_helps_in_noise():
+    assert np.median(slanted(15, 25, noise=20)) < 0.95 * np.median(slanted(15, noise=20))
+
+
+def test_a_wide_window_does_not_reach_over_rims():
+    posts = World()
+    narrow, both, wide = (np.mean(e > 0.5) for e in (
+        slanted(15, world=posts), slanted(15, 41, world=posts), slanted(41, world=posts)))
+    assert wide > 1.3 * narrow
+    assert both < 1.1 * narrow
+
+
+def test_levelled_converges_and_stays_where_nothing_is_told():
+    view = seen(UP, World(low=(-2.5, -3, -3), high=(3, 1.6, 4), posts=()))
+    refinement = JointRefinement(view.image, view.grid, view.axes, view.pairs)
+    start = off_by(view, 0.05)
+    once = refinement.levelled(start, 15)
+    twice = refinement.levelled(once.rho, 15, 25)
+    off = [np.median(np.abs(errors(found, view))) for found in (once, twice)]
+    assert max(off) < 0.015
+    blank = JointRefinement(np.full_like(view.image, 90), view.grid, view.axes,
+                            [(np.full_like(view.pairs[0][0], 90), view.pairs[0][1])])
+    np.testing.assert_allclose(blank.levelled(start, 15, 25).rho, start, rtol=1e-4)

@@ -2,8 +2,8 @@
 
 Nothing moves between the two views, and no frame before is needed, so more is made of the pair
 itself: what was matched forth and back stands where the sweep does not see something much nearer,
-and the sweep confirms what the match does not know. The pair alone is averaged with what
-refinement makes of it, for their errors have little in common.
+and the sweep confirms what the match does not know. What was matched is refined; where it is far
+away both are averaged, for their errors have little in common.
 """
 from __future__ import annotations
 
@@ -16,12 +16,14 @@ from .inverse_range import NOTHING, InverseRange, _grid_angles, inverse_range
 from .joint import Floats, JointMatcher, in_steps
 from .judgement import Found, Judged, by_agreement
 from .matching import Matcher, Parallax, stereo_grid
-from .refinement import JointRefinement
+from .refinement import JointRefinement, Refined
 from .sphere import polar_axes
-from .warp import PolarGrid
+from .warp import Map, PolarGrid
 
-_WINDOWS = (15,)  # px: one reference tells less of a pixel than several
+# px, of the pair alone and of several references: one tells less of a pixel.
+_WINDOW, _WIDE, _NARROW = 15, 25, 9
 _ALIKE = 1.0  # px by which a match and its refinement may differ
+_FAR = 30.0  # baselines, from which on both are averaged
 # Something near may hide there: so many times nearer, and nearer than so many baselines.
 _NEARER, _NEAR = 1.4, 35.0
 # It fits: squared grey levels, as a multiple of what the match has, and beside it.
@@ -59,7 +61,6 @@ class PairMatcher(JointMatcher):
 
     def __init__(self, method: str, first: Matcher, baseline_sigma: float = 0.0) -> None:
         super().__init__(method, first, baseline_sigma)
-        self._several = self._windows
         self._found: Parallax | None = None
 
     def measured(self, current: Frame, references: Sequence[Reference]) -> InverseRange:
@@ -68,7 +69,6 @@ class PairMatcher(JointMatcher):
         references : the other camera first, then earlier frames
         """
         alone = len(references) == 1
-        self._windows = _WINDOWS if alone else self._several
         new = self.measure(current, references)
         height, pose = current.image.shape[0], in_steps(references[0].pose)
         grid = stereo_grid(height)
@@ -78,7 +78,8 @@ class PairMatcher(JointMatcher):
         pixel = np.float32(grid.pixel / pose.baseline)
         known = matched.sigma < NOTHING
         alike = known & (np.abs(new.rho - matched.rho) < _ALIKE * pixel)
-        best = (new.rho + matched.rho) / 2 if alone else new.rho
+        far = matched.rho < np.float32(1 / (_FAR * pose.baseline))
+        best = np.where(far, (new.rho + matched.rho) / 2, new.rho) if alone else new.rho
         rho = np.where(known & ~alike, matched.rho, np.where(alike, best, new.rho))
         hidden = (new.other > np.float32(1 / (_NEAR * pose.baseline))) \
             & (new.other > np.float32(_NEARER) * rho) & (new.other > rho + pixel)
@@ -87,6 +88,15 @@ class PairMatcher(JointMatcher):
         sharper = matched.sigma if alone else np.minimum(matched.sigma, new.sigma)
         sigma = np.where(known & ~alike, matched.sigma, np.where(alike, sharper, new.sigma))
         return InverseRange(rho, np.where(believed, sigma, np.float32(NOTHING)), self.signed)
+
+    def _refined(self, view: Image8, grid: PolarGrid, axes: Floats,
+                 pairs: Sequence[tuple[Image8, RelativePose]], start: Map) -> Refined:
+        refinement = JointRefinement(view, grid, axes, pairs)
+        if len(pairs) > 1:
+            found = refinement.refined(start, _NARROW)
+            return refinement.levelled(found.rho, _NARROW) if self._sweeps else found
+        found = refinement.levelled(start, _WINDOW)
+        return refinement.levelled(found.rho, _WINDOW, _WIDE) if self._sweeps else found
 
     def _swept(self, pairs: Sequence[tuple[Image8, RelativePose]],
                ) -> list[tuple[Image8, RelativePose]]:

@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 _NOISE = 2.0  # grey levels, of the difference of two views beside what range explains
 _MOST = 400.0  # squared grey levels: a worse difference tells no more than that it does not fit
 _FIT_WINDOW, _MEAN_WINDOW = 7, 21
+_SAME = 0.3  # px by which a wide window may differ from a narrow one, to be taken in its place
 _UNFIT = 4.0  # a reference is left out where it fits that much worse than the best
 REACH = 0.7  # baseline over range beyond which a reference looks too different
 
@@ -103,6 +104,16 @@ def _gain(current: Image8, mean: Map, view: Image8, view_mean: Map) -> np.float3
     return np.float32(min(max(ratio, 0.3), 3.0))
 
 
+def _levelled(rho: Map, weighted: Map, weight: Map, window: int) -> tuple[Map, Map]:
+    """Inverse range averaged in windows, and the sum of weights in them."""
+    size = (window, window)
+    level = cv2.blur(rho, size)
+    sums = cv2.boxFilter(weighted - weight * level, -1, size, normalize=False)
+    information = cv2.boxFilter(weight, -1, size, normalize=False)
+    hold = np.float32(1e-3)
+    return np.asarray(level + (sums + hold * (rho - level)) / (information + hold)), information
+
+
 class JointRefinement:
     """The current view on a polar grid, to which references are fitted.
 
@@ -124,6 +135,31 @@ class JointRefinement:
 
     def refined(self, rho: Map, window: int) -> Refined:
         """One step from `rho` (1/m, of the grid's shape), averaged in windows of `window` px."""
+        weighted, weight, best = self._collected(rho)
+        size = (window, window)
+        sums, information = (cv2.boxFilter(m, -1, size, normalize=False)
+                             for m in (weighted, weight))
+        # Where nothing is told, the start stays.
+        hold = np.float32(1e-3)
+        return Refined((sums + hold * rho) / (information + hold), information, best)
+
+    def levelled(self, rho: Map, window: int, wide: int = 0) -> Refined:
+        """One step from `rho`, as `refined`, but what is averaged is how far each pixel lies off
+        the mean of its surroundings: where a surface slants, its slope is no noise.
+
+        wide : px of a second window, which counts where both say the same (after the intersection
+            of confidence intervals, Katkovnik 1999); 0 = none
+        """
+        weighted, weight, best = self._collected(rho)
+        narrow, information = _levelled(rho, weighted, weight, window)
+        if wide:
+            alike = np.float32(_SAME * self._grid.pixel / self._references[0][1].baseline)
+            broad, _ = _levelled(rho, weighted, weight, wide)
+            narrow = np.where(np.abs(broad - narrow) < alike, broad, narrow)
+        return Refined(narrow, information, best)
+
+    def _collected(self, rho: Map) -> tuple[Map, Map, Map]:
+        """Sums over the references of weighted measurements and of weights, and the misfit."""
         found = [self._difference(image, pose, rho) for image, pose in self._references]
         best = found[0][2].copy()
         for _, _, fit in found[1:]:
@@ -132,12 +168,7 @@ class JointRefinement:
         for (slope, error, fit), (_, pose) in zip(found, self._references, strict=True):
             rows_in_parallel(_collect, len(rho), rho, slope, error, fit, best,
                              np.float32(pose.baseline), weighted, weight)
-        size = (window, window)
-        sums, information = (cv2.boxFilter(m, -1, size, normalize=False)
-                             for m in (weighted, weight))
-        # Where nothing is told, the start stays.
-        hold = np.float32(1e-3)
-        return Refined((sums + hold * rho) / (information + hold), information, best)
+        return weighted, weight, best
 
     def misfit(self, rho: Map) -> Map:
         """Mean squared grey difference round each pixel, if it lies at `rho`, of the nearest
