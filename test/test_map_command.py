@@ -16,12 +16,15 @@ import room
 from making_bags import write_bag, write_video
 
 from sphstereo_ros import cli
+from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import FrameKey, PointCloud
 from sphstereo_ros.core.rotations import exp
-from sphstereo_ros.replay import map_run
+from sphstereo_ros.replay import map_cluster, map_run
 from sphstereo_ros.replay.bag_messages import make
+from sphstereo_ros.replay.map_chunks import Division, Recording
 from sphstereo_ros.replay.map_files import load_cloud, save_cloud, track_lines
 from sphstereo_ros.replay.records import BadInput
+from sphstereo_ros.replay.sources import open_source
 from sphstereo_ros.replay.submap_files import load_chunk
 from sphstereo_ros.ros import conversions as convert
 
@@ -158,8 +161,8 @@ def test_a_map_and_its_track(whole, capsys):
     assert sorted(p.name for p in whole.parent.iterdir()) == ['map.ply', 'map.tum']
 
 
-def start(bag: Path, out: Path, *words: str) -> subprocess.Popen[bytes]:
-    return subprocess.Popen([sys.executable, '-c', CODE, 'map', str(bag), '--out', str(out),
+def start(bag: Path, out: Path, *words: str, code: str = CODE) -> subprocess.Popen[bytes]:
+    return subprocess.Popen([sys.executable, '-c', code, 'map', str(bag), '--out', str(out),
                              '--chunk', str(CHUNK), *FAST, *words], stdout=subprocess.PIPE,
                             stderr=subprocess.PIPE)
 
@@ -302,3 +305,54 @@ def test_several_inputs_become_one_map(tmp_path, whole):
     track = np.loadtxt(out.with_suffix('.tum'))
     assert len(track) == COUNT
     np.testing.assert_allclose(track[:, 1], STEP * np.arange(COUNT), atol=0.03)
+
+
+# Many machines
+
+def test_two_workers_make_the_same_map(bag, whole, tmp_path):
+    """All of it: the command itself makes no chunk here."""
+    pytest.importorskip('distributed')
+    out = tmp_path / 'map.ply'
+    code = CODE.replace('sys.exit', 'map_run.MapRun.process = lambda *_: None; sys.exit')
+    process = start(bag, out, '--dask', 'local:2', code=code)
+    _, told = process.communicate(timeout=300)
+    assert process.returncode == 0, told
+    assert out.read_bytes() == whole.read_bytes()
+    assert out.with_suffix('.tum').read_bytes() == whole.with_suffix('.tum').read_bytes()
+
+
+class Nobody:
+    """A scheduler that must not be asked."""
+
+    def submit(self, *_, **__):
+        raise AssertionError('a finished chunk is made again')
+
+
+def test_workers_make_only_chunks_that_are_missing(bag, tmp_path):
+    pytest.importorskip('distributed')
+    source = open_source(bag)
+    run = map_run.MapRun(resolve({}), [Recording(bag, source, '/image')], tmp_path, CHUNK)
+    for n, chunk, _ in run.counted():
+        run.path(n, chunk).touch()
+    map_cluster.process(run, Nobody(), lambda _: None)
+    run.path(0, 1).unlink()
+    with pytest.raises(AssertionError, match='made again'):
+        map_cluster.process(run, Nobody(), lambda _: None)
+
+
+def test_a_chunk_by_itself_and_one_that_is_not_there(bag):
+    config, division = resolve({'stereo.matcher': 'bm', 'baseline.source': 'odometry'}), Division(
+        CHUNK, LEAD)
+    arguments = bag, '/image', 0.0, config, division
+    assert map_cluster._chunk(*arguments, 2).frames == COUNT - 2 * CHUNK
+    assert map_cluster._chunk(*arguments, 3) is None
+
+
+def test_a_cluster_that_is_not_there_is_one_line(bag, tmp_path, capsys, monkeypatch):
+    pytest.importorskip('distributed')
+    for address in ('local:0', 'local:many', 'nonsense://here'):
+        assert mapped(bag, tmp_path / 'map.ply', '--dask', address) == 2
+        assert capsys.readouterr().err.startswith('sphstereo map: --dask')
+    monkeypatch.setitem(sys.modules, 'distributed', None)
+    assert mapped(bag, tmp_path / 'map.ply', '--dask', 'local:2') == 2
+    assert "the extra 'dask'" in capsys.readouterr().err

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from tqdm import tqdm
@@ -11,8 +12,9 @@ from sphstereo_ros.cli import INTERRUPTED
 from sphstereo_ros.cli.run import output_path
 from sphstereo_ros.core.config import Config, resolve
 from sphstereo_ros.interrupts import interrupt_on_signals
+from sphstereo_ros.replay.map_chunks import Recording
 from sphstereo_ros.replay.map_files import SUFFIXES, known_suffix
-from sphstereo_ros.replay.map_run import CHUNK, LEAD, MapRun, Recording, with_scale, write_map
+from sphstereo_ros.replay.map_run import CHUNK, LEAD, MapRun, with_scale, write_map
 from sphstereo_ros.replay.parameter_files import load_values
 from sphstereo_ros.replay.records import BadInput
 from sphstereo_ros.replay.sources import image_topic, open_source
@@ -35,6 +37,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--chunk', type=int, default=CHUNK, metavar='FRAMES',
                         help='frames after which what is done is kept for a run that is '
                         'interrupted (default: %(default)s)')
+    parser.add_argument('--dask', metavar='ADDRESS', help='make chunks on the workers of this '
+                        "Dask scheduler, or local:N for N processes here (extra 'dask')")
 
 
 def main(arguments: argparse.Namespace) -> int:
@@ -45,7 +49,8 @@ def main(arguments: argparse.Namespace) -> int:
     recordings = []
     for path in arguments.inputs:
         source = open_source(path, arguments.fps)
-        recordings.append(Recording(path, source, image_topic(source, arguments.topic)))
+        recordings.append(Recording(path, source, image_topic(source, arguments.topic),
+                                    arguments.fps))
     config = _config(given, recordings)
     out = output_path(arguments.out, arguments.inputs[0], '_map.ply')
     for path in arguments.inputs[1:]:
@@ -53,7 +58,7 @@ def main(arguments: argparse.Namespace) -> int:
     known_suffix(out)
     run = MapRun(config, recordings, out.with_name(f'{out.name}.parts'), arguments.chunk)
     interrupt_on_signals()
-    return _mapped(run, out)
+    return _mapped(run, out, arguments.dask)
 
 
 def _config(given: dict[str, object], recordings: list[Recording]) -> Config:
@@ -68,11 +73,13 @@ def _config(given: dict[str, object], recordings: list[Recording]) -> Config:
     return config
 
 
-def _mapped(run: MapRun, out: Path) -> int:
+def _mapped(run: MapRun, out: Path, dask: str | None) -> int:
     run.prepare()
     total = sum(recording.count() for recording in run.recordings)
     with tqdm(total=total, initial=run.summary.resumed, unit='frame', disable=None) as progress:
         try:
+            if dask is not None:
+                _on_cluster(run, dask, progress.update)
             run.process(progress.update)
         except KeyboardInterrupt:
             print(f'interrupted; finished chunks are in {run.folder}: the same command goes on',
@@ -90,3 +97,9 @@ def _mapped(run: MapRun, out: Path) -> int:
     if run.summary.problems:
         raise BadInput('; '.join(run.summary.problems))
     return 0
+
+
+def _on_cluster(run: MapRun, address: str, advance: Callable[[int], object]) -> None:
+    from sphstereo_ros.replay.map_cluster import cluster, process
+    with cluster(address) as client:
+        process(run, client, advance)
