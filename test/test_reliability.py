@@ -106,10 +106,10 @@ def test_where_opinions_differ_the_error_is_larger():
 def test_a_fit_finds_the_percentiles():
     """Errors that are Gaussian, of a standard deviation that one look tells."""
     rng = np.random.default_rng(0)
-    looks = rng.normal(size=(60000, LOOKS)).astype(np.float32)
+    looks = rng.normal(size=(30000, LOOKS)).astype(np.float32)
     sigma = 0.05 * np.exp(0.5 * looks[:, 3])
     error = (sigma * rng.normal(size=len(looks))).astype(np.float32)
-    fitted = fit([Samples(looks, error, np.ones_like(error))], rng, steps=3000)
+    fitted = fit([Samples(looks, error, np.ones_like(error))], rng, steps=1000)
     out = np.exp(fitted.layers(looks)[-1])
     assert np.median(out[:, 0] / (sigma + 0.003)) == pytest.approx(1.0, abs=0.1)
     assert np.median(out[:, 1] / (2 * sigma + 0.003)) == pytest.approx(1.0, abs=0.15)
