@@ -145,6 +145,15 @@ def test_a_wall_is_as_far_as_its_nearest_point_in_the_sector() -> None:
             assert out.state[at] == SectorState.FREE
 
 
+def test_under_what_hangs_just_above_the_band_nothing_is_free() -> None:
+    """The crown of a tree begins nowhere exactly: single leaves hang lower, unseen."""
+    at = sector_of(8, 1)
+    over = detect(seen(floor(1.8), post(8, 1, 0.6, low=1.1)))
+    assert over.state[at] == SectorState.UNKNOWN
+    high = detect(seen(floor(1.8), post(8, 1, 0.6, low=2.0)))
+    assert high.state[at] == SectorState.FREE
+
+
 def test_what_stands_on_the_edge_is_in_both_sectors() -> None:
     edge = np.radians(-2.5)
     out = detect(seen(post(5 * np.cos(edge), -5 * np.sin(edge), 0.1)))

@@ -34,6 +34,8 @@ Floats = NDArray[np.float64]
 _POLE = Hidden(0.15, 0.5, 10.0, 0.75, False)
 _BODY = Hidden(1.0, 0.4, 10.0, 0.15, True, nearest=2.0)
 _BEFORE = 0.6
+# m above the band that must be free, too: a crown that begins there has leaves below it.
+_OVER = 0.5
 _DOUBT = 0.01  # m²: a sector with so much that is too small to be believed is not free
 _COLUMNS, _PIXELS_PER_COLUMN = 10, 1.3  # of a sector, at most, and where the image has as many
 _CELL = math.radians(1.0)  # height of the cells of `open_space`, at least
@@ -109,12 +111,13 @@ class _Picture:
         survey(image.range, image.sigma, *self._angles, self._turn,
                self._camera.astype(np.float32), self._band(ground).array(),
                distances.astype(np.float32), cell, seen, flat, column)
-        place = partial(hiding_place, seen, distances, limits=limits, ground=ground,
-                        camera=self._camera, cell=cell)
-        free = np.isinf(place(replace(_POLE, trust_sky=limits.trust_sky)))
+        place = partial(hiding_place, seen, distances, ground=ground, camera=self._camera,
+                        cell=cell)
+        free = np.isinf(place(replace(_POLE, trust_sky=limits.trust_sky), replace(
+            limits, height_above=limits.height_above + _OVER)))
         hidden = np.full(SECTORS, np.inf)
         if limits.hidden_width > 0:
-            hidden = place(replace(_BODY, width=limits.hidden_width))
+            hidden = place(replace(_BODY, width=limits.hidden_width), limits)
         nearest, doubt, believed = nearest_things(
             flat, column, np.ascontiguousarray(self._angles[0][:, 0]), limits.minimum,
             limits.maximum, columns)
