@@ -13,6 +13,7 @@ import numpy as np
 
 from .frames import Frame, Image8, Reference, RelativePose
 from .inverse_range import NOTHING, InverseRange, _grid_angles, inverse_range
+from .jit import kernel, rows_in_parallel
 from .joint import Floats, JointMatcher, in_steps
 from .judgement import Found, Judged, by_agreement
 from .matching import Matcher, Parallax, stereo_grid
@@ -51,6 +52,34 @@ def with_cones(pair: InverseRange, motion: InverseRange, direction: Floats) -> I
                         pair.signed and motion.signed)
 
 
+@kernel
+def _pair_rows(first: int, last: int, matched: Map, matched_sigma: Map, refined: Map,
+               refined_sigma: Map, other: Map, agreed: Image8, limits: Map, alone: bool,
+               swept: bool, rho: Map, sigma: Map) -> None:  # pragma: no cover - compiled
+    """Of the match, its refinement and the second opinion: inverse range, and σ where believed.
+
+    limits : 1/m of a pixel, of where both are averaged, of what is near
+    """
+    pixel, far, near = limits
+    for i in range(first, last):
+        for j in range(rho.shape[1]):
+            value, spread, first_value = refined[i, j], refined_sigma[i, j], matched[i, j]
+            known = matched_sigma[i, j] < np.float32(NOTHING)
+            if known and abs(value - first_value) < np.float32(_ALIKE) * pixel:
+                spread = matched_sigma[i, j] if alone else min(spread, matched_sigma[i, j])
+                if first_value < far:
+                    value = np.float32(0.5) * (value + first_value)
+            elif known:
+                value, spread = first_value, matched_sigma[i, j]
+            hides = other[i, j]
+            hidden = (hides > near and hides > np.float32(_NEARER) * value
+                      and hides > value + pixel)
+            sure = agreed[i, j] > 0
+            believed = (sure or (known and not hidden)) if swept else (sure and known)
+            rho[i, j] = value
+            sigma[i, j] = spread if believed else np.float32(NOTHING)
+
+
 class PairMatcher(JointMatcher):
     """Measures the current frame with another camera.
 
@@ -75,19 +104,12 @@ class PairMatcher(JointMatcher):
         assert self._found is not None
         matched = inverse_range(self._found, grid, polar_axes(pose.direction), pose, height,
                                 self._baseline_sigma)
-        pixel = np.float32(grid.pixel / pose.baseline)
-        known = matched.sigma < NOTHING
-        alike = known & (np.abs(new.rho - matched.rho) < _ALIKE * pixel)
-        far = matched.rho < np.float32(1 / (_FAR * pose.baseline))
-        best = np.where(far, (new.rho + matched.rho) / 2, new.rho) if alone else new.rho
-        rho = np.where(known & ~alike, matched.rho, np.where(alike, best, new.rho))
-        hidden = (new.other > np.float32(1 / (_NEAR * pose.baseline))) \
-            & (new.other > np.float32(_NEARER) * rho) & (new.other > rho + pixel)
-        agreed = new.agreed > 0
-        believed = (known & ~hidden) | agreed if self._sweeps else known & agreed
-        sharper = matched.sigma if alone else np.minimum(matched.sigma, new.sigma)
-        sigma = np.where(known & ~alike, matched.sigma, np.where(alike, sharper, new.sigma))
-        return InverseRange(rho, np.where(believed, sigma, np.float32(NOTHING)), self.signed)
+        limits = np.array([grid.pixel, 1 / _FAR if alone else -np.inf, 1 / _NEAR],
+                          np.float32) / np.float32(pose.baseline)
+        rho, sigma = np.empty_like(new.rho), np.empty_like(new.rho)
+        rows_in_parallel(_pair_rows, height, matched.rho, matched.sigma, new.rho, new.sigma,
+                         new.other, new.agreed, limits, alone, self._sweeps, rho, sigma)
+        return InverseRange(rho, sigma, self.signed)
 
     def _refined(self, view: Image8, grid: PolarGrid, axes: Floats,
                  pairs: Sequence[tuple[Image8, RelativePose]], start: Map) -> Refined:

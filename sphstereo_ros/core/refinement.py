@@ -25,6 +25,7 @@ Floats = NDArray[np.float64]
 _NOISE = 2.0  # grey levels, of the difference of two views beside what range explains
 _MOST = 400.0  # squared grey levels: a worse difference tells no more than that it does not fit
 _FIT_WINDOW, _MEAN_WINDOW = 7, 21
+_HOLD = 1e-3  # information of the start: where nothing is told, it stays
 _SAME = 0.3  # px by which a wide window may differ from a narrow one, to be taken in its place
 _UNFIT = 4.0  # a reference is left out where it fits that much worse than the best
 REACH = 0.7  # baseline over range beyond which a reference looks too different
@@ -107,11 +108,31 @@ def _gain(current: Image8, mean: Map, view: Image8, view_mean: Map) -> np.float3
 def _levelled(rho: Map, weighted: Map, weight: Map, window: int) -> tuple[Map, Map]:
     """Inverse range averaged in windows, and the sum of weights in them."""
     size = (window, window)
-    level = cv2.blur(rho, size)
-    sums = cv2.boxFilter(weighted - weight * level, -1, size, normalize=False)
-    information = cv2.boxFilter(weight, -1, size, normalize=False)
-    hold = np.float32(1e-3)
-    return np.asarray(level + (sums + hold * (rho - level)) / (information + hold)), information
+    level, off = cv2.blur(rho, size), np.empty_like(rho)
+    rows_in_parallel(_off_level, len(rho), weighted, weight, level, off)
+    sums, information = (np.asarray(cv2.boxFilter(m, -1, size, normalize=False))
+                         for m in (off, weight))
+    rows_in_parallel(_from_level, len(rho), rho, level, sums, information, off)
+    return off, information
+
+
+@fast_kernel
+def _off_level(first: int, last: int, weighted: Map, weight: Map, level: Map,
+               out: Map) -> None:  # pragma: no cover - compiled
+    for i in range(first, last):
+        for j in range(out.shape[1]):
+            out[i, j] = weighted[i, j] - weight[i, j] * level[i, j]
+
+
+@fast_kernel
+def _from_level(first: int, last: int, rho: Map, level: Map, sums: Map, information: Map,
+                out: Map) -> None:  # pragma: no cover - compiled
+    hold = np.float32(_HOLD)
+    for i in range(first, last):
+        for j in range(out.shape[1]):
+            start = level[i, j]
+            out[i, j] = start + (sums[i, j] + hold * (rho[i, j] - start)) / (
+                information[i, j] + hold)
 
 
 class JointRefinement:
@@ -139,8 +160,7 @@ class JointRefinement:
         size = (window, window)
         sums, information = (cv2.boxFilter(m, -1, size, normalize=False)
                              for m in (weighted, weight))
-        # Where nothing is told, the start stays.
-        hold = np.float32(1e-3)
+        hold = np.float32(_HOLD)
         return Refined((sums + hold * rho) / (information + hold), information, best)
 
     def levelled(self, rho: Map, window: int, wide: int = 0) -> Refined:
