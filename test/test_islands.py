@@ -29,6 +29,26 @@ def test_what_is_little_farther_stays():
     assert not far_islands(r).any()
 
 
+def large(reaches_down: bool) -> np.ndarray:
+    """A far patch of 0.6 % of the sphere in a wall; a floor may lead there."""
+    r = room(3.0)
+    r[100:126, 200:226] = 12
+    if reaches_down:
+        for k in range(24):  # from 12 m to the border in steps
+            r[126 + k, 200:226] = 12 - 0.35 * k
+    return r
+
+
+def test_a_large_pane_that_is_framed_all_round_is_unknown():
+    found = far_islands(large(reaches_down=False))
+    assert found[100:126, 200:226].mean() > 0.95
+    assert found.sum() < 30 * 30
+
+
+def test_a_view_to_which_the_floor_leads_stays():
+    assert not far_islands(large(reaches_down=True))[100:126, 200:226].any()
+
+
 def test_a_wide_view_stays():
     r = room(3.0)
     r[60:140, 100:260] = 20

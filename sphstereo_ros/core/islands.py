@@ -13,12 +13,13 @@ _NEAR = (2.0, 2.8, 3.9, 5.5)  # m: each is looked at as the border between near 
 _BEYOND = 1.3  # far begins that many times farther
 _STEP = 4  # px: every n-th pixel and row is looked at
 _RING = 15  # of those, how wide the ring round an island may be
-_LARGEST = 0.002  # of all pixels
-_SHARE = 0.5  # of what is known in the ring must be near
+# Islands up to so large a share of all pixels; so much of what is known in the ring must be near.
+# A large one must be framed: a real view, down a corridor say, has a floor that leads there.
+_SMALL, _LARGE = (0.002, 0.5), (0.008, 0.9)
 
 
 def far_islands(distance: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Where small patches of far range lie among what is near.
+    """Where patches of far range lie among what is near.
 
     distance : (H, 2H) metres; NaN unknown, ±Inf as published. Returns (H, 2H).
     """
@@ -35,10 +36,11 @@ def far_islands(distance: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 def _islands(far: NDArray[np.bool_], near: NDArray[np.bool_],
              known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Connected patches of `far`, small, whose surroundings are `near` where they are `known`."""
+    """Connected patches of `far`, not too large, that what is `near` surrounds where `known`."""
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(far.view(np.uint8),
                                                                     connectivity=8)
-    candidate = statistics[:, cv2.CC_STAT_AREA] < _LARGEST * far.size
+    area = statistics[:, cv2.CC_STAT_AREA] / far.size
+    candidate = area < _LARGE[0]
     candidate[0] = False
     inside = candidate[labels]
     if not inside.any():
@@ -48,4 +50,5 @@ def _islands(far: NDArray[np.bool_], near: NDArray[np.bool_],
     ring = (grown > 0) & ~inside
     around = np.bincount(grown[ring & known], minlength=count)
     of_near = np.bincount(grown[ring & near], minlength=count)
-    return np.asarray((candidate & (of_near > _SHARE * np.maximum(around, 1)))[labels])
+    needed = np.where(area < _SMALL[0], _SMALL[1], _LARGE[1])
+    return np.asarray((candidate & (of_near > needed * np.maximum(around, 1)))[labels])
