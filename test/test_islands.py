@@ -30,23 +30,23 @@ def test_what_is_little_farther_stays():
 
 
 def large(reaches_down: bool) -> np.ndarray:
-    """A far patch of 0.6 % of the sphere in a wall; a floor may lead there."""
-    r = room(3.0)
-    r[100:126, 200:226] = 12
+    """A far patch of 0.6 % of the image in a wall; a floor may lead there."""
+    r = np.full((2 * HEIGHT, 4 * HEIGHT), 3, np.float32)
+    r[200:252, 400:452] = 12
     if reaches_down:
-        for k in range(24):  # from 12 m to the border in steps
-            r[126 + k, 200:226] = 12 - 0.35 * k
+        for k in range(48):  # from 12 m to the border in steps
+            r[252 + k, 400:452] = 12 - 0.175 * k
     return r
 
 
 def test_a_large_pane_that_is_framed_all_round_is_unknown():
     found = far_islands(large(reaches_down=False))
-    assert found[100:126, 200:226].mean() > 0.95
-    assert found.sum() < 30 * 30
+    assert found[200:252, 400:452].mean() > 0.95
+    assert found.sum() < 60 * 60
 
 
 def test_a_view_to_which_the_floor_leads_stays():
-    assert not far_islands(large(reaches_down=True))[100:126, 200:226].any()
+    assert not far_islands(large(reaches_down=True))[200:252, 400:452].any()
 
 
 def test_a_wide_view_stays():

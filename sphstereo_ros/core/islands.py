@@ -16,6 +16,7 @@ _RING = 15  # of those, how wide the ring round an island may be
 # Islands up to so large a share of all pixels; so much of what is known in the ring must be near.
 # A large one must be framed: a real view, down a corridor say, has a floor that leads there.
 _SMALL, _LARGE = (0.002, 0.5), (0.008, 0.9)
+_FRAMED = 60  # of those looked at: a large island of fewer tells nothing of its frame
 
 
 def far_islands(distance: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -39,8 +40,9 @@ def _islands(far: NDArray[np.bool_], near: NDArray[np.bool_],
     """Connected patches of `far`, not too large, that what is `near` surrounds where `known`."""
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(far.view(np.uint8),
                                                                     connectivity=8)
-    area = statistics[:, cv2.CC_STAT_AREA] / far.size
-    candidate = area < _LARGE[0]
+    size = statistics[:, cv2.CC_STAT_AREA]
+    small = size < _SMALL[0] * far.size
+    candidate = small | ((size < _LARGE[0] * far.size) & (size >= _FRAMED))
     candidate[0] = False
     inside = candidate[labels]
     if not inside.any():
@@ -50,5 +52,5 @@ def _islands(far: NDArray[np.bool_], near: NDArray[np.bool_],
     ring = (grown > 0) & ~inside
     around = np.bincount(grown[ring & known], minlength=count)
     of_near = np.bincount(grown[ring & near], minlength=count)
-    needed = np.where(area < _SMALL[0], _SMALL[1], _LARGE[1])
+    needed = np.where(small, _SMALL[1], _LARGE[1])
     return np.asarray((candidate & (of_near > needed * np.maximum(around, 1)))[labels])
