@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sphstereo_ros.core.voxels import VoxelMap
+from sphstereo_ros.core.voxels import VoxelMap, VoxelPoints
 
 GREY = np.uint8(7)
 
@@ -38,8 +40,16 @@ def test_a_voxel_counts_each_frame_once():
 
 def test_an_uncertain_point_goes_into_a_larger_voxel():
     voxels = VoxelMap(0.1, 100)
-    add(voxels, [[0.05, 0.05, 0.05]] * 3, [0.02, 0.15, 0.35])
+    add(voxels, [[0.05, 0.05, 0.05]] * 3, [0.39, 0.6, 1.4])
     assert sorted(voxels.points().level.tolist()) == [0, 1, 2]
+
+
+def test_where_a_sharper_point_is_the_others_go():
+    voxels = VoxelMap(0.1, 100)
+    add(voxels, [[0.05, 0.05, 0.05], [0.15, 0.15, 0.15], [-0.15, 0.15, 0.15], [1.3, 0.1, 0.1]],
+        [0.01, 0.6, 0.6, 0.6])
+    points = voxels.points().finest()
+    np.testing.assert_allclose(sorted(points.xyz[:, 0]), [-0.15, 0.05, 1.3], atol=1e-6)
 
 
 def test_negative_coordinates_do_not_share_the_voxels_of_positive_ones():
@@ -54,17 +64,37 @@ def test_what_is_out_of_reach_is_counted():
     assert (len(voxels), voxels.out_of_reach) == (1, 2)
 
 
+def seen(xyz: np.ndarray, weight: np.ndarray, frames: int) -> VoxelPoints:
+    count = len(xyz)
+    return VoxelPoints(xyz, np.full((count, 3), GREY), np.full(count, frames, np.uint16),
+                       np.ones(count, np.float32), weight, np.zeros(count, np.uint8), 0.05)
+
+
+@pytest.mark.parametrize(('often', 'edge', 'kept'), [(700, 0.05, 700), (300, 0.1, 300)])
+def test_what_one_frame_saw_goes_first_unless_it_is_the_most(often, edge, kept):
+    """A line of points 0.06 m apart in a map of 1000 voxels of 0.05 m."""
+    voxels = VoxelMap(0.05, 1000)
+    xyz = np.zeros((1001, 3), np.float32)
+    xyz[:, 0] = 0.06 * np.arange(1001) + 0.01
+    frames = np.where(np.arange(1001) < often, 2, 1).astype(np.uint16)
+    voxels.add_voxels(replace(seen(xyz, np.full(1001, 1e4, np.float32), 1), frames=frames))
+    points = voxels.points()
+    assert voxels.edge == pytest.approx(edge)
+    assert points.points[points.frames > 1].sum() >= kept
+    assert len(points) == (often + 1 if edge == 0.05 else pytest.approx(600, abs=20))
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000), st.integers(1000, 3000))
 def test_the_budget_holds_and_no_weight_is_lost(seed, most):
     rng = np.random.default_rng(seed)
     voxels, weights, moments = VoxelMap(0.05, most), 0.0, np.zeros(3)
-    for frame in range(6):
+    for _ in range(6):
         xyz = rng.uniform(-3, 3, (1500, 3)).astype(np.float32)
-        sigma = rng.uniform(0.01, 0.2, 1500).astype(np.float32)
-        voxels.add(xyz, sigma, np.full((1500, 3), GREY), frame)
-        weights += float((1 / sigma.astype(float)**2).sum())
-        moments += (xyz / sigma.astype(float)[:, None]**2).sum(axis=0)
+        weight = rng.uniform(25, 10_000, 1500).astype(np.float32)
+        voxels.add_voxels(seen(xyz, weight, 2))
+        weights += float(weight.sum(dtype=float))
+        moments += (xyz * weight.astype(float)[:, None]).sum(axis=0)
         assert len(voxels) <= most
     points = voxels.points()
     assert voxels.edge > 0.05

@@ -1,4 +1,4 @@
-"""The command `sphstereo bench accuracy|obstacles|speed|live`."""
+"""The command `sphstereo bench accuracy|obstacles|map|speed|live`."""
 from __future__ import annotations
 
 import argparse
@@ -21,7 +21,7 @@ from .sequences import GROUND_TRUTH, Scenes, saved
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command's arguments."""
     kinds = parser.add_subparsers(dest='kind', required=True,
-                                  metavar='accuracy|obstacles|speed|live')
+                                  metavar='accuracy|obstacles|map|speed|live')
     accuracy = kinds.add_parser('accuracy', help='pose and range against exact truth')
     _add_accuracy(accuracy)
     speed = kinds.add_parser('speed', help='the chain against one StereoBM call')
@@ -32,10 +32,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     speed.add_argument('-p', action='append', default=[], dest='overrides', metavar='NAME:=VALUE')
     obstacles = kinds.add_parser('obstacles', help='obstacle sectors against exact truth')
     _add_obstacles(obstacles)
+    street = kinds.add_parser('map', help='maps of a drive against exact truth')
+    _add_map(street)
     live = kinds.add_parser('live', help='the nodes over DDS')
-    for one in (accuracy, obstacles, speed):
+    for one in (accuracy, obstacles, street, speed):
         one.add_argument('--height', type=int, default=960, help='(default: %(default)s)')
-    for one in (accuracy, obstacles, speed, live):
+    for one in (accuracy, obstacles, street, speed, live):
         one.add_argument('--json', action='store_true', help='end with one line of JSON')
     from . import live as live_bench
     live_bench.add_arguments(live)
@@ -87,6 +89,20 @@ def _add_obstacles(parser: argparse.ArgumentParser) -> None:
                         metavar='NAME:=VALUE', help='the same, one by one')
 
 
+def _add_map(parser: argparse.ArgumentParser) -> None:
+    from .mapping import KINDS
+    parser.add_argument('--seed', type=int, default=REPORTED_SEEDS[0],
+                        help='of the street (default: %(default)s)')
+    parser.add_argument('--frames', type=int, default=100, help='(default: %(default)s)')
+    parser.add_argument('--kinds', help=f'of {",".join(KINDS)} (default: all)')
+    parser.add_argument('--memory', type=int, metavar='FRAMES', help='instead: peak memory of '
+                        '`sphstereo map` on so many frames, there and back again')
+    parser.add_argument('--cache', type=Path, metavar='DIR', help='keep what is rendered here, '
+                        'and take it from here the next time')
+    parser.add_argument('-p', action='append', default=[], dest='overrides',
+                        metavar='NAME:=VALUE', help='parameter')
+
+
 def main(args: argparse.Namespace) -> int:
     """Run one benchmark; returns the exit status."""
     if args.kind == 'live':
@@ -96,6 +112,8 @@ def main(args: argparse.Namespace) -> int:
         result = _binocular(args) if args.binocular else _accuracy(args)
     elif args.kind == 'obstacles':
         result = _obstacles(args)
+    elif args.kind == 'map':
+        result = _map(args)
     else:
         result = _speed(args)
     if args.json:
@@ -128,11 +146,12 @@ def _accuracy(args: argparse.Namespace) -> dict[str, Any]:
     return summaries
 
 
-def _chosen(given: str | None, default: Sequence[str], there: Sequence[str]) -> Sequence[str]:
+def _chosen(given: str | None, default: Sequence[str], there: Sequence[str],
+            option: str = '--methods') -> Sequence[str]:
     names = list(default) if given is None else given.split(',')
     unknown = sorted(set(names) - set(there))
     if unknown:
-        raise BadInput(f'--methods: {unknown[0]} is none of {", ".join(there)}')
+        raise BadInput(f'{option}: {unknown[0]} is none of {", ".join(there)}')
     return names
 
 
@@ -183,6 +202,24 @@ def _obstacle_inputs(args: argparse.Namespace) -> Iterator[tuple[str, Iterable[T
     for name in () if args.inputs else args.scenes:
         scenes = Scenes(name, args.seeds, args.frames, args.height, None, args.cache)
         yield from ((name, sequence) for sequence in scenes.sequences())
+
+
+def _map(args: argparse.Namespace) -> dict[str, Any]:
+    import tempfile
+
+    from .mapping import KINDS, Drive, measure, peak_memory, table
+    kinds = _chosen(args.kinds, KINDS, KINDS, '--kinds')
+    given = load_values([], args.overrides)
+    with tempfile.TemporaryDirectory() as folder:
+        drive = Drive(args.seed, args.frames, args.height, args.cache or Path(folder))
+        if args.memory:
+            peak = peak_memory(drive, args.memory, [w for v in args.overrides for w in ('-p', v)])
+            print(f'peak memory of {args.memory} frames: {peak["peak_mb"]:.0f} MB')
+            return dict(peak)
+        with tqdm(total=len(kinds) * args.frames, unit='frame', disable=None) as progress:
+            figures = measure(drive, kinds, given, progress.update)
+    print(table(figures))
+    return dict(figures)
 
 
 def _plotter() -> Callable[[dict[str, Any], Path], list[Path]]:

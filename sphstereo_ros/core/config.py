@@ -304,17 +304,15 @@ class MappingConfig:
     voxel: float = _p('mapping.voxel', 0.05, 'points within such a cube become one; uncertain '
                       'points in cubes up to 32 times as large', unit='m', low=0.001, high=100.0)
     max_points: int = _p('mapping.max_points', 2_000_000, 'of a map, about 100 bytes each; when '
-                         'it has as many, the cubes are doubled', low=1000, high=100_000_000,
-                         runtime=False)
+                         'it has as many, what one frame saw is dropped, then cubes are doubled',
+                         low=1000, high=100_000_000, runtime=False)
     max_range: float = _p('mapping.max_range', 40.0, 'what is farther from the camera is left out',
                           unit='m', low=0.1, high=10000.0)
-    max_relative_sigma: float = _p('mapping.max_relative_sigma', 0.03, 'sigma over range above '
+    max_relative_sigma: float = _p('mapping.max_relative_sigma', 0.25, 'sigma over range above '
                                    'which a range is left out', low=0.0001, high=1.0)
-    max_sigma: float = _p('mapping.max_sigma', 0.08, 'standard deviation above which a point 10 m '
-                          'from the track is left out; elsewhere with the square of the distance, '
-                          'but no less than half of mapping.voxel', unit='m', low=0.0001,
-                          high=1000.0)
-    min_frames: int = _p('mapping.min_frames', 3, 'points that fewer frames saw are left out',
+    max_sigma: float = _p('mapping.max_sigma', 2.0, 'standard deviation above which a point is '
+                          'left out', unit='m', low=0.0001, high=1000.0)
+    min_frames: int = _p('mapping.min_frames', 5, 'points that fewer frames saw are left out',
                          low=1, high=1000)
     camera_height: float = _p('mapping.camera_height', 0.0, 'height of the camera above the '
                               'ground, from which metres come where baseline.source tells none; '

@@ -1,8 +1,7 @@
 """One registered cloud and the track, from the range images of a drive or flight.
 
 Every frame is placed by visual odometry (`track`), its points are fused into voxels with weights
-1/σ² (`voxels`), and what is left at the end is what enough frames saw, sharp enough for its
-distance from the track.
+1/σ² (`voxels`), and what is left at the end is what enough frames saw, where nothing sharper is.
 """
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ from .frames import (
 )
 from .ground_scale import HEIGHT_SIGMA, ground_scale
 from .history import inverse
-from .jit import kernel, rows_in_parallel
+from .jit import kernel
 from .motion import OdometrySample
 from .pose_graph import Floats
 from .rotations import Mount, mount
@@ -37,8 +36,6 @@ from .voxels import Map32, VoxelMap, VoxelPoints
 
 _ROWS = 220  # of a range image that take part, about; each in as many columns as make it even
 _LEAST_SIGMA = 0.003  # m: no range is better, whatever it tells
-_SPACING = 0.5  # m between the positions that stand for the track
-_FAR = 10.0  # m, the distance that mapping.max_sigma is for
 
 
 @dataclass(frozen=True)
@@ -184,8 +181,7 @@ class Mapper:
 
     def cloud(self, stamp: int) -> PointCloud:
         """What is worth keeping so far, in `odom`: so many points that they take up to 8 MB."""
-        points = confirmed(self.voxels.points(), np.array([f.position for f in self._fused]),
-                           self._config.mapping)
+        points = confirmed(self.voxels.points(), self._config.mapping)
         most = MAX_BYTES // BYTES_PER_POINT
         if len(points) > most:  # voxels come in the order of a hash: any part is even
             points = points.chosen(np.linspace(0, len(points) - 1, most).astype(np.intp))
@@ -199,7 +195,6 @@ class Mapper:
                           Frame(key, np.zeros((8, 16), np.uint8)))
         self.voxels.add(scan.xyz, scan.sigma, scan.bgr, 0)
         self.voxels.points()
-        distance_to_track(np.zeros((1, 3), np.float32), np.zeros((1, 3)))
         self._count = 0
 
     @property
@@ -251,39 +246,10 @@ class Mapper:
         self._fused.append(placed)
 
 
-def confirmed(points: VoxelPoints, positions: Floats, config: MappingConfig) -> VoxelPoints:
-    """What enough frames saw, and sharp enough for its distance from the nearest camera.
-
-    positions : (N, 3) of the track
-    """
-    points = points.chosen(points.frames >= config.min_frames)
-    if not len(points) or not len(positions):
-        return points
-    distance = distance_to_track(points.xyz, positions)
-    allowed = np.maximum(config.max_sigma * (distance / _FAR)**2, config.voxel / 2)
-    return points.chosen(points.sigma <= allowed)
-
-
-@kernel
-def _nearest_rows(first: int, last: int, xyz: Map32, track: Map32,
-                  out: Map32) -> None:  # pragma: no cover - compiled
-    for n in range(first, last):
-        best = np.float32(np.inf)
-        for k in range(track.shape[0]):
-            x, y, z = xyz[n, 0] - track[k, 0], xyz[n, 1] - track[k, 1], xyz[n, 2] - track[k, 2]
-            best = min(best, x * x + y * y + z * z)
-        out[n] = np.sqrt(best)
-
-
-def distance_to_track(xyz: Map32, positions: Floats) -> Map32:
-    """Distance (N,) of points (N, 3) to the nearest of the positions, thinned to some spacing."""
-    kept = [positions[0]]
-    for place in positions[1:]:
-        if np.linalg.norm(place - kept[-1]) > _SPACING:
-            kept.append(place)
-    out = np.empty(len(xyz), np.float32)
-    rows_in_parallel(_nearest_rows, len(xyz), xyz, np.array(kept, np.float32), out)
-    return out
+def confirmed(points: VoxelPoints, config: MappingConfig) -> VoxelPoints:
+    """What enough frames saw, sharp enough, where nothing sharper is."""
+    return points.chosen((points.frames >= config.min_frames)
+                         & (points.sigma <= config.max_sigma)).finest()
 
 
 def map_cloud(points: VoxelPoints, stamp: int, frame_id: str = 'odom') -> PointCloud:

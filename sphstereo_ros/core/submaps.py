@@ -19,7 +19,7 @@ from .registration import registered
 from .track import TrackedFrame
 from .voxels import Map32, VoxelMap, VoxelPoints
 
-_NEAR = 25.0  # m from the gap: what is registered
+_NEAR, _SHARP = 25.0, 0.1  # m from the gap, and of sigma: what is registered
 _GAP = 10.0  # s: over a longer one the last motion tells nothing
 _LEAST_SPREAD = 0.05  # m of shared track that tells a scale
 
@@ -149,7 +149,7 @@ class MapBuilder:
 
 
 def _near(points: VoxelPoints, place: Floats) -> Map32:
-    fine = (points.level <= 1) & (points.frames >= 2)
+    sharp = points.sigma <= _SHARP
     near = np.linalg.norm(points.xyz - place.astype(np.float32), axis=1) < _NEAR
-    chosen: Map32 = points.xyz[fine & near]
+    chosen: Map32 = points.xyz[sharp & near]
     return chosen

@@ -1,12 +1,13 @@
 """Fusion of points into voxels: weighted means, in bounded memory.
 
-A point goes into a voxel as large as it is uncertain: the finest edge is doubled until it is no
-less than the point's standard deviation. Voxels lie in a hash table of fixed size (open
-addressing); when it holds as many as are allowed, the finest edge is doubled and all is put anew.
+A point goes into a voxel that fits how uncertain it is: the finest edge is doubled until it is no
+less than a quarter of the point's standard deviation. Voxels lie in a hash table of fixed size
+(open addressing). When it holds as many as are allowed, those that one frame saw are dropped;
+where that is not enough, or these are the most, the finest edge is doubled and all is put anew.
 """
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,12 @@ Bytes = NDArray[np.uint8]
 Counts = NDArray[np.uint16]
 
 LEVELS = 6
+_FINENESS = 4.0  # edges in a standard deviation, at most
 _EMPTY = -1
 _BITS = 20  # of each index: ± 500,000 voxels
 _HALF = 1 << (_BITS - 1)
 _FILLED = 0.6  # of the table at most
+_AFTER = 0.75  # of the voxels that are allowed: so many are left when room was made
 # What is kept of a voxel: points, weight Σ 1/σ², weighted offset from its centre in edges (3),
 # weighted colour (3).
 _SUMS = 8
@@ -35,7 +38,7 @@ class VoxelPoints:
 
     xyz : (N, 3) float32 metres; bgr : (N, 3) uint8; frames : (N,) uint16, how many saw it;
     points : (N,) float32, how many were fused, of the sum of 1/σ² `weight`; level : (N,) uint8,
-    0 = finest edge, doubled that often
+    0 = the finest `edge` (m), doubled that often
     """
 
     xyz: Map32
@@ -44,6 +47,7 @@ class VoxelPoints:
     points: Map32
     weight: Map32
     level: Bytes
+    edge: float
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -58,14 +62,25 @@ class VoxelPoints:
     def chosen(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> VoxelPoints:
         """Those that are chosen."""
         return VoxelPoints(self.xyz[which], self.bgr[which], self.frames[which],
-                           self.points[which], self.weight[which], self.level[which])
+                           self.points[which], self.weight[which], self.level[which],
+                           self.edge)
+
+    def finest(self) -> VoxelPoints:
+        """Without those in whose cube a finer one lies: what was seen sharply needs no more."""
+        kept = np.ones(len(self), bool)
+        for level in range(1, LEVELS):
+            finer, these = self.level < level, np.nonzero(self.level == level)[0]
+            cells = np.floor(self.xyz / np.float32(self.edge * (1 << level))).astype(np.int64)
+            keys = ((cells[:, 0] << (2 * _BITS)) + (cells[:, 1] << _BITS)) + cells[:, 2]
+            kept[these] = ~np.isin(keys[these], keys[finer])
+        return self.chosen(kept)
 
     def moved(self, rotation: NDArray[np.float64], position: NDArray[np.float64],
               scale: float) -> VoxelPoints:
         """All at scale · R · x + p."""
         xyz = scale * (self.xyz.astype(np.float64) @ rotation.T) + position
         return VoxelPoints(xyz.astype(np.float32), self.bgr, self.frames, self.points,
-                           self.weight / np.float32(scale * scale), self.level)
+                           self.weight / np.float32(scale * scale), self.level, scale * self.edge)
 
 
 @kernel
@@ -92,7 +107,7 @@ def _add(first: int, xyz: Map32, sigma: Map32, bgr: Bytes, points: Map32, weight
     for n in range(first, xyz.shape[0]):
         level = int(levels[n])
         size = edge * (1 << level)
-        while level < LEVELS - 1 and size < sigma[n]:
+        while level < LEVELS - 1 and _FINENESS * size < sigma[n]:
             level, size = level + 1, 2 * size
         x, y, z = xyz[n, 0] / size, xyz[n, 1] / size, xyz[n, 2] / size
         if not max(abs(x), abs(y), abs(z)) < _HALF - 1:
@@ -169,7 +184,7 @@ class VoxelMap:
         one = np.ones(len(xyz), np.float32)
         self._fuse(VoxelPoints(xyz, bgr, one.astype(np.uint16), one,
                                np.float32(1) / (sigma * sigma),
-                               np.zeros(len(xyz), np.uint8)), frame)
+                               np.zeros(len(xyz), np.uint8), self.edge), frame)
 
     def add_voxels(self, points: VoxelPoints) -> None:
         """Fuse what another map holds."""
@@ -183,29 +198,31 @@ class VoxelMap:
                          self._sums, self._frames, self._newest, self._state)
             if first == len(given):
                 break
-            self._coarsen()
+            self._make_room()
         self.out_of_reach = int(self._state[1])
 
-    def _coarsen(self) -> None:
-        """Double the edge until a quarter of the room is free, at least."""
+    def _make_room(self) -> None:
+        """Free a quarter of the room, at least."""
         lost, held = self._state[1], self.points()
-        while True:
+        again = held.frames > 1
+        if 2 * np.count_nonzero(again) >= len(held):
+            held = held.chosen(again)
+        while len(held) > _AFTER * self._most:
             self.edge *= 2
-            held = VoxelPoints(held.xyz, held.bgr, held.frames, held.points, held.weight,
-                               np.maximum(held.level, 1) - np.uint8(1))
             self._clear()
-            self._fuse(held, -1)
-            self._state[1] += lost
-            if len(self) <= 0.75 * self._most:
-                return
+            self._fuse(replace(held, level=np.maximum(held.level, 1) - np.uint8(1),
+                               edge=self.edge), -1)
             held = self.points()
+        self._clear()
+        self._fuse(held, -1)
+        self._state[1] += lost
 
     def points(self) -> VoxelPoints:
         """All voxels, in the order of the table."""
         count = len(self)
         out = VoxelPoints(np.empty((count, 3), np.float32), np.empty((count, 3), np.uint8),
                           np.empty(count, np.uint16), np.empty(count, np.float32),
-                          np.empty(count, np.float32), np.empty(count, np.uint8))
+                          np.empty(count, np.float32), np.empty(count, np.uint8), self.edge)
         _read(self._keys, self._sums, self._frames, self.edge, out.xyz, out.bgr, out.frames,
               out.points, out.weight, out.level)
         return out

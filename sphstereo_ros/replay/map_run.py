@@ -162,7 +162,7 @@ class MapRun:
                     last = max(last, self._join(builder, recording, segment, shift))
                 chunk += 1
         frames, points = builder.finish()
-        kept = confirmed(points, _positions(frames), self.config.mapping)
+        kept = confirmed(points, self.config.mapping)
         self.summary.placed, self.summary.points = len(frames), len(kept)
         self.summary.length = _length(frames)
         return frames, kept

@@ -16,7 +16,7 @@ from sphstereo_ros.core.voxels import VoxelPoints
 from sphstereo_ros.replay.map_files import written_whole
 from sphstereo_ros.replay.records import BadInput
 
-_VERSION = 1
+_VERSION = 2
 _POINTS = ('xyz', 'bgr', 'frames', 'points', 'weight', 'level')
 
 
@@ -47,7 +47,8 @@ def save_chunk(path: Path, chunk: Chunk) -> None:
         submap = segment.submap
         frames = submap.frames
         told['segments'].append({'keys': [(f.key.stamp, f.key.frame_id) for f in frames],
-                                 'ways': (submap.assumed, submap.tracked)})
+                                 'ways': (submap.assumed, submap.tracked),
+                                 'edge': submap.points.edge})
         arrays[f'{n}_rotations'] = np.array([f.rotation for f in frames]).reshape(-1, 3, 3)
         arrays[f'{n}_positions'] = np.array([f.position for f in frames]).reshape(-1, 3)
         arrays[f'{n}_scales'] = np.array([f.scale for f in frames])
@@ -89,7 +90,8 @@ def _segment(data: Any, n: int, told: dict[str, Any]) -> Segment:
               for key, rotation, position, scale in zip(
                   told['keys'], data[f'{n}_rotations'], data[f'{n}_positions'],
                   data[f'{n}_scales'], strict=True)]
-    points = VoxelPoints(*(data[f'{n}_points_{name}'] for name in _POINTS))
+    arrays = {name: data[f'{n}_points_{name}'] for name in _POINTS}
+    points = VoxelPoints(**arrays, edge=told['edge'])
     odometry = None
     if f'{n}_odometry' in data:
         first, last = (RelativePose(p[:, :3], p[:, 3]) for p in data[f'{n}_odometry'])

@@ -29,7 +29,7 @@ def write_bag(sequence: SavedSequence, path: Path) -> None:
             key = FrameKey(frame.stamp, CAMERA)
             out.write('/odometry', frame.stamp, odometry(frame))
             out.write('/image/compressed', frame.stamp,
-                      compressed_message(make, key, 'bgr8; jpeg compressed bgr8', _jpeg(frame)))
+                      compressed_message(make, key, 'bgr8; jpeg compressed bgr8', jpeg(frame)))
             out.write('/ground_truth/range', frame.stamp,
                       depth_message(make, key, _range(sequence, index, frame)))
 
@@ -53,7 +53,7 @@ def write_binocular_bag(sequence: SavedSequence, path: Path) -> None:
                 index = pair[side]
                 frame = sequence[index]
                 key = FrameKey(frame.stamp, camera)
-                image = compressed_message(make, key, 'bgr8; jpeg compressed bgr8', _jpeg(frame))
+                image = compressed_message(make, key, 'bgr8; jpeg compressed bgr8', jpeg(frame))
                 if side == 'bottom':
                     out.write('/odometry', frame.stamp, odometry(frame))
                     out.write('/ground_truth/range', frame.stamp,
@@ -73,7 +73,8 @@ def odometry(frame: TruthFrame) -> object:
                 child_frame_id=BASE, pose=make('geometry_msgs/msg/PoseWithCovariance', pose=pose))
 
 
-def _jpeg(frame: TruthFrame) -> bytes:
+def jpeg(frame: TruthFrame) -> bytes:
+    """The frame as it was saved, or at quality 95."""
     if frame.jpeg is not None:
         return frame.jpeg
     return bytes(cv2.imencode('.jpg', frame.image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1])
