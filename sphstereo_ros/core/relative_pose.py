@@ -62,9 +62,15 @@ class PoseEstimate:
 
 
 def tangent(direction: Floats) -> Floats:
-    """Two unit vectors (3, 2) that span the plane normal to `direction`."""
-    u = np.linalg.svd(direction[:, None])[0]
-    return np.asarray(u[:, 1:])
+    """Two unit vectors (3, 2) that span the plane normal to the unit vector `direction`.
+
+    Duff et al., Building an Orthonormal Basis, Revisited, JCGT 2017.
+    """
+    x, y, z = (float(value) for value in direction)
+    sign = math.copysign(1.0, z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    return np.array([[1 + sign * x * x * a, b], [sign * b, sign + y * y * a], [-sign * x, -y]])
 
 
 def epipolar_residuals(rotation: Floats, direction: Floats, points: Correspondences) -> Floats:
@@ -253,7 +259,7 @@ def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iter
         sums = np.zeros((6, 7))
         inliers = _normal_equations(residual, derivatives, points.sigma, width, sums)
         normal = spread.T @ sums[:, :6] @ spread
-        if not np.isfinite(normal).all() or np.linalg.cond(normal) > 1e10:
+        if not np.isfinite(normal).all() or _is_singular(normal):
             return None
         step = -np.linalg.solve(normal, spread.T @ sums[:, 6])
         rotation = rotations.exp(step[:3]) @ rotation
@@ -266,6 +272,12 @@ def refine(rotation: Floats, direction: Floats, points: Correspondences, *, iter
     covariance[:len(normal), :len(normal)] = np.linalg.inv(normal) * scale**2
     return PoseEstimate(rotation, direction, inliers, covariance,
                         scale * float(np.median(points.sigma)))
+
+
+def _is_singular(normal: Floats) -> bool:
+    """Whether a symmetric matrix fixes too little."""
+    sizes = np.abs(np.linalg.eigvalsh(normal))
+    return float(sizes.max()) > 1e10 * float(sizes.min())
 
 
 def cells_of(pixels: NDArray[np.floating], size: int) -> NDArray[np.intp]:

@@ -86,13 +86,12 @@ def skew(vector: ArrayLike) -> FloatArray:
 
 def exp(rotation_vector: ArrayLike) -> FloatArray:
     """Rotation vector (3,) (axis · angle, radians) → (3, 3) matrix."""
-    vector = np.asarray(rotation_vector, np.float64)
-    angle = float(np.linalg.norm(vector))
-    k = skew(vector)
-    # np.sinc is sin(πx)/(πx), exact at zero.
-    first = float(np.sinc(angle / np.pi))
-    second = 0.5 * float(np.sinc(angle / (2 * np.pi))) ** 2
-    return np.eye(3) + first * k + second * (k @ k)
+    k = skew(rotation_vector)
+    angle = math.hypot(k[2, 1], k[0, 2], k[1, 0])
+    half = 0.5 * angle
+    first = math.sin(angle) / angle if half > 0 else 1.0
+    second = 0.5 * (math.sin(half) / half)**2 if half > 0 else 0.5
+    return np.asarray(np.eye(3) + first * k + second * (k @ k))
 
 
 def log(rotation: FloatArray) -> FloatArray:
