@@ -12,11 +12,23 @@ from two_cameras import BASELINE, PERIOD, RPY, error, frame, parameters, view
 
 from sphstereo_ros.core import rotations
 from sphstereo_ros.core.binocular import BinocularPairer
+from sphstereo_ros.core.camera import Equirectangular
 from sphstereo_ros.core.chain import Chain, StageResults
 from sphstereo_ros.core.config import ParameterError, resolve
-from sphstereo_ros.core.frames import Drop, Frame, PairedWindow
+from sphstereo_ros.core.frames import (
+    AlignedWindow,
+    Drop,
+    Frame,
+    FrameKey,
+    PairedWindow,
+    Reference,
+    RelativePose,
+)
+from sphstereo_ros.core.inverse_range import InverseRange
 from sphstereo_ros.core.motion import OdometrySample
+from sphstereo_ros.core.pair_matching import PairMatcher
 from sphstereo_ros.core.pairing import Outcome
+from sphstereo_ros.core.stereo import SphericalStereo
 from sphstereo_ros.core.synchronisation import PATIENCE, SIDES
 
 
@@ -288,3 +300,24 @@ def test_baselines_by_distance_need_a_source_of_motion() -> None:
     with pytest.raises(ParameterError, match='between the cameras'):
         rig.config(pairing__baselines=[0.5])
     assert rig.config(pairing__baselines=[0.5], baseline__source='odometry')
+
+
+def test_a_reflection_in_the_floor_is_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the pair sees beyond the floor is not there; all else is as measured."""
+    height = 120
+    bearings = Equirectangular(height, 2 * height).bearings()
+    rho = np.where(bearings[..., 1] > 0.2, bearings[..., 1] / 1.5, 1 / 8).astype(np.float32)
+    mirrored = np.zeros(rho.shape, bool)
+    mirrored[95:105, 50:70] = True
+    seen_there = np.where(mirrored, rho / 2, rho).astype(np.float32)
+    sigma = (0.01 * rho).astype(np.float32)
+    monkeypatch.setattr(PairMatcher, 'measured',
+                        lambda *_: InverseRange(seen_there, sigma.copy(), True))
+    blank = np.zeros((height, 2 * height), np.uint8)
+    up = RelativePose(np.eye(3), np.array([0.0, -BASELINE, 0.0]))
+    window = AlignedWindow(Frame(FrameKey(0, 'bottom'), blank),
+                           (Reference(Frame(FrameKey(0, 'top'), blank), up),))
+    measured = SphericalStereo(rig.config(stereo__matcher='joint')).process(window)
+    assert not isinstance(measured, Drop)
+    np.testing.assert_array_equal(np.isnan(measured.range), mirrored)
+    np.testing.assert_allclose(measured.range[~mirrored], 1 / rho[~mirrored], rtol=1e-5)

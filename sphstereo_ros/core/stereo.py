@@ -21,7 +21,7 @@ from .inverse_range import NOTHING, InverseRange, fuse, inverse_range, published
 from .islands import far_islands
 from .joint import JointMatcher
 from .matching import matcher, stereo_grid
-from .moving import moving_parts, under_floor
+from .moving import floor_plane, moving_parts, under_floor
 from .pair_matching import PairMatcher, with_cones
 from .range_memory import RangeMemory
 from .rig import Rig
@@ -85,6 +85,7 @@ class SphericalStereo:
             if len(window.references) > 1:
                 motion = self._measure(window.current, window.references[1])
                 estimate = with_cones(estimate, motion, first.pose.direction)
+            estimate = self._above_floor(estimate)
         elif self._joint is not None:
             estimate, moving = self._remembered(self._joint, window, mask)
         else:
@@ -95,6 +96,14 @@ class SphericalStereo:
             r[hidden] = sigma[hidden] = np.nan
         return RangeImage(window.current.key, r, sigma, window.is_metric, moving=moving,
                           camera=camera)
+
+    def _above_floor(self, estimate: InverseRange) -> InverseRange:
+        """Nothing at rest lies under the floor: what seems to is a reflection in it."""
+        plane = floor_plane(estimate.rho, estimate.sigma,
+                            -mount(self.config.camera).rotation[2])
+        if plane is not None:
+            estimate.sigma[under_floor(estimate.rho, estimate.sigma, plane) != 0] = NOTHING
+        return estimate
 
     def _remembered(self, joint: JointMatcher, window: AlignedWindow,
                     mask: Image8 | None) -> tuple[InverseRange, Image8]:
