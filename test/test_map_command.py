@@ -290,6 +290,21 @@ def test_bad_usage_is_refused(bag, tmp_path, capsys):
     assert command() == 2
 
 
+def test_two_stills_make_a_map_and_an_empty_one_is_refused(tmp_path, capsys):
+    frames = room.forward(2, STEP, HEIGHT)
+    bag = write_bag(tmp_path / 'bag', [('/image', frame.key.stamp, convert.frame_message(
+        make, frame)) for frame in frames])
+    out, known = tmp_path / 'map.ply', ('-p', f'baseline.length:={STEP}')
+    assert command(bag, '--out', out, *FAST, *known) == 2
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) == 1
+    assert 'mapping.min_frames' in error[0]
+    assert not list(tmp_path.glob('map*'))
+    assert command(bag, '--out', out, *FAST, *known, '-p', 'mapping.min_frames:=1') == 0
+    assert len(load_cloud(out).xyz) > 500
+    np.testing.assert_allclose(np.loadtxt(out.with_suffix('.tum'))[:, 1], [0, STEP], atol=1e-6)
+
+
 def test_several_inputs_become_one_map(tmp_path, whole):
     """Two halves of one drive, as two bags."""
     frames = room.forward(COUNT, STEP, HEIGHT)

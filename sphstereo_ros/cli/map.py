@@ -90,6 +90,11 @@ def _mapped(run: MapRun, out: Path, dask: str | None) -> int:
         run.remove_chunks()
         causes = ', '.join(run.summary.drops) or 'too few frames'
         raise BadInput(f'no frame could be placed ({causes})')
+    if not len(points):
+        run.remove_chunks()
+        limits = run.config.mapping
+        raise BadInput(f'no point was seen by {limits.min_frames} frames (mapping.min_frames) '
+                       f'with a sigma below {limits.max_sigma:g} m (mapping.max_sigma)')
     track = out.with_suffix('.tum')
     write_map(out, track, frames, points, run.config)
     run.remove_chunks()

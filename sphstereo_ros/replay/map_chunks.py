@@ -27,7 +27,7 @@ from sphstereo_ros.ros.conversions import decode_frame
 from sphstereo_ros.ros.images import read_mask
 from sphstereo_ros.ros.messages import SECOND
 
-_SHORTEST = 5  # frames of a segment
+_SHORTEST = 5  # frames of a segment, where the track was lost
 
 Add = Callable[[Any], Sequence[StageResults | Drop]]
 
@@ -98,7 +98,7 @@ class ChunkMapper:
     def finish(self) -> Chunk:
         """No more is to come."""
         self._take(self._chain.flush())
-        self._end_segment()
+        self._end_segment(2 if self._at_start else _SHORTEST)  # two stills are a recording, too
         return self.chunk
 
     def _drop(self, drop: Drop) -> None:
@@ -136,11 +136,11 @@ class ChunkMapper:
             self._ends = [None if start is None else first_pose(self._config, start)]
         return self._mapper.add(result.aligned, result.range_image, odometry=sample, fuse=fuse)
 
-    def _end_segment(self) -> None:
+    def _end_segment(self, least: int = _SHORTEST) -> None:
         if self._mapper is None:
             return
         submap = self._mapper.finish()
-        if len(submap.frames) >= _SHORTEST:
+        if len(submap.frames) >= least:
             first, last = self._ends[0], self._ends[-1]
             known = None if first is None or last is None else (first, last)
             self.chunk.segments.append(Segment(submap, known))
