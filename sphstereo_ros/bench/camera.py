@@ -66,7 +66,10 @@ def play(outputs: Sequence[tuple[Any, list[bytearray]]], rate: float,
                 _wait(stamp / SECOND + after[n] - sent)
                 publisher, messages = outputs[n]
                 message = messages[count % len(messages)]
-                stamp, sent = time.monotonic_ns(), after[n]
+                # The second stamps when it was due, as a camera that exposes does, however late
+                # this process gets its turn.
+                stamp = stamp + round((after[n] - sent) * SECOND) if stamp else time.monotonic_ns()
+                sent = after[n]
                 struct.pack_into('<iI', message, 4, *divmod(stamp, SECOND))
                 publisher.publish(bytes(message))
                 if n == 0:
