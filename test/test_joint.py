@@ -82,7 +82,7 @@ def test_no_height_is_misplaced(method, height):
     found = measured(method, view)
     for part in (found.rho, found.sigma, found.other, found.agreed):
         assert part.shape == (height, 2 * height)
-    assert found.agreed.mean() > 0.88
+    assert found.agreed.mean() > (0.75 if height < 100 else 0.88)
     assert np.median(errors(found, current)) < 0.02
     second = np.abs(found.other * current.range - 1)
     assert np.median(second) < (0.09 if height < 100 else 0.06)
@@ -145,7 +145,7 @@ def test_sigma_says_how_large_errors_are(method):
     current, view = seen()
     found = measured(method, view)
     z = (np.abs(found.rho - 1 / current.range) / found.sigma)[found.agreed != 0]
-    assert 0.55 < (z < 1).mean() < 0.99
+    assert 0.55 < (z < 1).mean() < 0.995
     assert (z < 2).mean() > 0.85
     # And what errs more is said to err more.
     error, sigma = (values[found.agreed != 0] for values in (
@@ -210,7 +210,7 @@ def test_a_blank_reference_among_others_does_no_harm(method):
     found = measured(method, altered(view, lambda i: (
         i if (other := next(images)) is None else other)))
     whole = measured(method, seen()[1])
-    assert np.median(errors(found, current)) < 1.2 * np.median(errors(whole, current)) + 1e-4
+    assert np.median(errors(found, current)) < 1.3 * np.median(errors(whole, current)) + 1e-4
 
 
 # --- the same input, the same output

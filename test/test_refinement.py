@@ -9,7 +9,7 @@ import pytest
 from analytic_world import Ball, World
 from polar_views import HEIGHT, PolarView, Vector, polar_view
 
-from sphstereo_ros.core.refinement import JointRefinement, Refined
+from sphstereo_ros.core.refinement import NEAR_BY, JointRefinement, Refined
 from sphstereo_ros.core.sphere import polar_bearings
 
 RADIUS = 3.0
@@ -223,3 +223,15 @@ def test_levelled_converges_and_stays_where_nothing_is_told():
     blank = JointRefinement(np.full_like(view.image, 90), view.grid, view.axes,
                             [(np.full_like(view.pairs[0][0], 90), view.pairs[0][1])])
     np.testing.assert_allclose(blank.levelled(start, 15, 25).rho, start, rtol=1e-4)
+
+
+def test_adapted_is_levelled_near_by_and_averaged_far_away():
+    baseline = 0.1
+    view = seen(((0, 0, -baseline),), ROOM)
+    refinement = JointRefinement(view.image, view.grid, view.axes, view.pairs)
+    start = off_by(view, 0.02)
+    far, near = refinement.refined(start, 21).rho, refinement.levelled(start, 15, 25).rho
+    slanted = far > 1 / (NEAR_BY * baseline)
+    assert 0.1 < slanted.mean() < 0.9
+    np.testing.assert_array_equal(refinement.adapted(start, 21, (15, 25)).rho,
+                                  np.where(slanted, near, far))

@@ -63,7 +63,7 @@ def test_the_compiled_network_is_the_network():
     error, units = expected_error(seen, GRID, BASELINES, network())
     np.testing.assert_array_equal(unit, units.ravel())
     out = outputs(looks, network())
-    likely = unit * np.exp(np.maximum(out[:, 0], out[:, 1] - 1.1))
+    likely = unit * np.exp(np.maximum(out[:, 0], out[:, 1] - 1.3))
     nearer = unit * np.exp(out[:, 2])
     margin = (parts[1].rho.ravel() + nearer) * min(BASELINES) * 40
     likely = np.where(margin > 1, np.maximum(likely, 0.67 * nearer), likely)

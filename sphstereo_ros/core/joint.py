@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .frames import UNSCALED, Frame, Image8, Reference, RelativePose
+from .guided_sweep import guided_sweep
 from .inverse_range import NOTHING, _grid_angles, _polar_row, pose_sigmas
 from .jit import fast_kernel, kernel, rows_in_parallel
 from .judgement import DEPENDENT, Found, Judged, by_agreement, by_looks
@@ -32,6 +33,10 @@ Floats = NDArray[np.float64]
 # change faster than one a pixel on a road.
 _SWEPT = 5.0
 _WINDOWS = {'joint': (9, 9), 'joint_fast': (9,)}
+# px: of what was swept, and on a slope; of one reference alone, which tells less of a pixel, at
+# _TALL rows: less where there are fewer, for it must not see across what is there.
+_LAST, _LAST_LEVEL = 9, (9, 15)
+_ALONE, _ALONE_LEVEL, _TALL = 21, (15, 25), 960
 # Light: how far round about, of half a turn; grey levels; percentile that differs by a share.
 _LIGHT, _DARK, _MOSTLY, _ALIKE = 1 / 30, 8.0, 90, 0.08
 _CELL, _SPREADS = 8, (1.0, 6.0)  # px, cells: how what was not matched is filled for a start
@@ -156,6 +161,11 @@ def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Ma
             told_out[i, j] = told[rn, cn]
 
 
+def _scaled(most: int, least: int, height: int) -> int:
+    """An odd window of `most` px at _TALL rows."""
+    return max(least, min(most, round(most * height / _TALL)) // 2 * 2 + 1)
+
+
 class JointMatcher:
     """Measures a window.
 
@@ -186,6 +196,7 @@ class JointMatcher:
         if self._sweeps:
             coarse, _ = sweep(view, grid, axes, self._swept(pairs))
             other = cv2.resize(coarse, grid.shape[::-1], interpolation=cv2.INTER_LINEAR)
+            refined = self._sharpened(view, grid, axes, pairs, refined)
         else:
             other = matched
         found = Found(view, refined, other, matched, parallax)
@@ -215,10 +226,28 @@ class JointMatcher:
     def _refined(self, view: Image8, grid: PolarGrid, axes: Floats,
                  pairs: Sequence[tuple[Image8, RelativePose]], start: Map) -> Refined:
         refinement = JointRefinement(view, grid, axes, pairs)
+        if self._sweeps and len(pairs) == 1:
+            wide, *level = (_scaled(most, least, grid.height) for most, least in zip(
+                (_ALONE, *_ALONE_LEVEL), (_LAST, *_LAST_LEVEL), strict=True))
+            return refinement.adapted(refinement.refined(start, wide).rho, wide,
+                                      (level[0], level[1]))
         found = refinement.refined(start, self._windows[0])
         for window in self._windows[1:]:
             found = refinement.refined(found.rho, window)
         return found
+
+    def _sharpened(self, view: Image8, grid: PolarGrid, axes: Floats,
+                   pairs: Sequence[tuple[Image8, RelativePose]], known: Refined) -> Refined:
+        """Swept near what is known, and refined within half a level: a window alone would carry
+        ranges across rims. One reference alone has too little parallax for that.
+        """
+        if len(pairs) == 1:
+            return known
+        swept = guided_sweep(view, grid, axes, pairs, known.rho)
+        rho, step = (np.asarray(cv2.resize(m, grid.shape[::-1], interpolation=cv2.INTER_LINEAR))
+                     for m in (swept.rho, np.float32(0.5) * swept.step))
+        found = JointRefinement(view, grid, axes, pairs).adapted(rho, _LAST, _LAST_LEVEL)
+        return replace(found, rho=np.clip(found.rho, rho - step, rho + step))
 
     def _on_sphere(self, refined: Refined, judged: Judged, grid: PolarGrid, axes: Floats,
                    pairs: Sequence[tuple[Image8, RelativePose]], height: int) -> Measurement:

@@ -14,7 +14,9 @@ from .sweep import reduction
 from .warp import Map, PolarGrid
 
 MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
-_SURE = 0.5  # of the unit: a likely error with which something counts as measured
+# Of the unit: a likely error with which something counts as measured; one reference alone is sure
+# of little, so more is left to the frames that follow.
+_SURE, _SURE_ALONE = 0.8, 1.2
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
 _AGREES, _LEVELS, _SLACK = 0.05, 0.75, 1.5
@@ -54,7 +56,8 @@ def by_looks(found: Found, grid: PolarGrid, baselines: Sequence[float]) -> Judge
     """What looks as here errs so much as a rule; baselines of the references in m."""
     seen = look(found.view, found.refined, found.other, found.matched, found.parallax)
     error, unit = expected_error(seen, grid, baselines, network())
-    sure = (error < _SURE * unit) & (found.refined.misfit < MISFIT)
+    limit = np.float32(_SURE if len(baselines) > 1 else _SURE_ALONE)
+    sure = (error < limit * unit) & (found.refined.misfit < MISFIT)
     return Judged(found.other, error, sure.astype(np.uint8))
 
 

@@ -120,6 +120,11 @@ class PairMatcher(JointMatcher):
         found = refinement.levelled(start, _WINDOW)
         return refinement.levelled(found.rho, _WINDOW, _WIDE) if self._sweeps else found
 
+    def _sharpened(self, view: Image8, grid: PolarGrid, axes: Floats,
+                   pairs: Sequence[tuple[Image8, RelativePose]], known: Refined) -> Refined:
+        del view, grid, axes, pairs
+        return known
+
     def _swept(self, pairs: Sequence[tuple[Image8, RelativePose]],
                ) -> list[tuple[Image8, RelativePose]]:
         return list(pairs[:1])

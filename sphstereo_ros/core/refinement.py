@@ -28,6 +28,7 @@ _FIT_WINDOW, _MEAN_WINDOW = 7, 21
 _HOLD = 1e-3  # information of the start: where nothing is told, it stays
 _SAME = 0.3  # px by which a wide window may differ from a narrow one, to be taken in its place
 _UNFIT = 4.0  # a reference is left out where it fits that much worse than the best
+NEAR_BY = 30.0  # baselines of the nearest reference: there, slopes matter more than noise
 REACH = 0.7  # baseline over range beyond which a reference looks too different
 
 
@@ -105,6 +106,14 @@ def _gain(current: Image8, mean: Map, view: Image8, view_mean: Map) -> np.float3
     return np.float32(min(max(ratio, 0.3), 3.0))
 
 
+def _averaged(rho: Map, weighted: Map, weight: Map, window: int) -> tuple[Map, Map]:
+    """Inverse range averaged in windows, and the sum of weights in them."""
+    sums, information = (cv2.boxFilter(m, -1, (window, window), normalize=False)
+                         for m in (weighted, weight))
+    hold = np.float32(_HOLD)
+    return np.asarray((sums + hold * rho) / (information + hold)), information
+
+
 def _levelled(rho: Map, weighted: Map, weight: Map, window: int) -> tuple[Map, Map]:
     """Inverse range averaged in windows, and the sum of weights in them."""
     size = (window, window)
@@ -157,11 +166,7 @@ class JointRefinement:
     def refined(self, rho: Map, window: int) -> Refined:
         """One step from `rho` (1/m, of the grid's shape), averaged in windows of `window` px."""
         weighted, weight, best = self._collected(rho)
-        size = (window, window)
-        sums, information = (cv2.boxFilter(m, -1, size, normalize=False)
-                             for m in (weighted, weight))
-        hold = np.float32(_HOLD)
-        return Refined((sums + hold * rho) / (information + hold), information, best)
+        return Refined(*_averaged(rho, weighted, weight, window), best)
 
     def levelled(self, rho: Map, window: int, wide: int = 0) -> Refined:
         """One step from `rho`, as `refined`, but what is averaged is how far each pixel lies off
@@ -171,12 +176,26 @@ class JointRefinement:
             of confidence intervals, Katkovnik 1999); 0 = none
         """
         weighted, weight, best = self._collected(rho)
+        return Refined(*self._on_level(rho, weighted, weight, window, wide), best)
+
+    def adapted(self, rho: Map, window: int, level: tuple[int, int]) -> Refined:
+        """One step from `rho`: as `refined` where little parallax has to be averaged widely, and
+        `levelled` by (window, wide) where, near by, slopes are what disturbs.
+        """
+        weighted, weight, best = self._collected(rho)
+        far, information = _averaged(rho, weighted, weight, window)
+        near, _ = self._on_level(rho, weighted, weight, *level)
+        slanted = far > np.float32(1 / (NEAR_BY * self._references[0][1].baseline))
+        return Refined(np.where(slanted, near, far), information, best)
+
+    def _on_level(self, rho: Map, weighted: Map, weight: Map, window: int,
+                  wide: int) -> tuple[Map, Map]:
         narrow, information = _levelled(rho, weighted, weight, window)
         if wide:
             alike = np.float32(_SAME * self._grid.pixel / self._references[0][1].baseline)
             broad, _ = _levelled(rho, weighted, weight, wide)
             narrow = np.where(np.abs(broad - narrow) < alike, broad, narrow)
-        return Refined(narrow, information, best)
+        return narrow, information
 
     def _collected(self, rho: Map) -> tuple[Map, Map, Map]:
         """Sums over the references of weighted measurements and of weights, and the misfit."""

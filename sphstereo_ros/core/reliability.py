@@ -31,7 +31,7 @@ _TEXTURE = 9
 LEAK = 0.1
 _AT_ONCE = 64  # pixels that the network judges
 _LOGARITHMS = (0, 2, 4, 6, 8, 10, 12, 14, 16, 19, 21, 23, 24, 25, 26, 27, 29)  # of the inputs
-_TAIL = 1.1  # logarithm of how many standard deviations the 95th percentile may be away
+_TAIL = 1.3  # logarithm of how many standard deviations the 95th percentile may be away
 # What may be much nearer is not known well, however likely the measurement is: the 98th percentile
 # counts with a share, where it means nearer than so many shortest baselines.
 _SHORT, _NEAR_BY = 0.67, 40.0

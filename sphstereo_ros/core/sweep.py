@@ -27,7 +27,7 @@ Volume = NDArray[np.uint16]
 
 _MARGIN = 8
 _NEAREST = 0.3  # m: the last level, at the latest
-_CLOSEST, _MOST_LEVELS = 2.0, 256  # of the nearest baseline over range
+_CLOSEST, MOST_LEVELS = 2.0, 256  # of the nearest baseline over range
 _LEVEL = 1.5  # px of parallax between levels, of the longest baseline in use
 REACH = 0.6  # baseline over range up to which a reference takes part: it looks alike
 _UNSEEN = 20  # cost of a level for a reference that takes no part
@@ -49,18 +49,19 @@ class _View:
     contrast: Image8
 
 
-def levels(baselines: Sequence[float], pixel: float) -> Floats:
+def levels(baselines: Sequence[float], pixel: float, step: float = _LEVEL) -> Floats:
     """Inverse ranges (N,), 1/m, at even steps of parallax of the longest baseline that sees well.
 
     The first two are beyond infinity: what lies at infinity has neighbours on both sides.
+    step : px of parallax between levels
     """
     longest_first = sorted(baselines, reverse=True)
-    found = [-2 * _LEVEL * pixel / longest_first[0]]
+    found = [-2 * step * pixel / longest_first[0]]
     nearest = min(1 / _NEAREST, _CLOSEST / longest_first[-1])
-    while found[-1] < nearest and len(found) < _MOST_LEVELS:
+    while found[-1] < nearest and len(found) < MOST_LEVELS:
         usable = [b for b in longest_first if found[-1] * b <= REACH] or longest_first[-1:]
         near = found[-1] * usable[0] > REACH
-        found.append(found[-1] + (2.0 if near else _LEVEL) * pixel / usable[0])
+        found.append(found[-1] + (max(2.0, step) if near else step) * pixel / usable[0])
     return np.array(found)
 
 

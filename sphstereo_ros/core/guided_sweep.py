@@ -1,0 +1,281 @@
+"""Guided sweep: what is known so far, sharpened by all references before smoothness decides.
+
+A sweep (`sweep`) with levels as fine as the longest baseline tells apart fails on slanted
+surfaces: their range changes by more than a level from pixel to pixel, and that is what a path is
+charged for. What is known so far gives the slant: where it is locally a plane, levels count from
+that plane (Scharstein et al. 2017), so that following it is free. It also decides what no grey
+tells: a level far from it costs a little more. Per level only the two references that agree best
+count, so that one from which a point is hidden does no harm.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .frames import Image8, RelativePose
+from .jit import kernel, rows_in_parallel
+from .sphere import polar_axes
+from .sweep import (
+    _BANDS,
+    _CONTRAST,
+    _CONTRAST_LIMIT,
+    _FREE,
+    _MARGIN,
+    MOST_LEVELS,
+    REACH,
+    Census,
+    Floats,
+    Volume,
+    _different_bits,
+    _place_rows,
+    _polar_table,
+    _shrunk,
+    _view,
+    _winner_rows,
+    levels,
+    reduction,
+)
+from .warp import Map, PolarGrid, polar_map, resample, with_border
+
+Levels = NDArray[np.int32]
+Bytes = NDArray[np.uint8]
+
+_LEVEL = 1.0  # px of parallax between levels, of the longest baseline in use
+_COARSER = 1.2  # times, until there are few enough
+# What is known costs nothing, a level that many away costs the most.
+_HOLD, _HELD = 6, 10
+_PLANE, _FLAT, _BEND = 12, 1.5, 0.15  # px round about; levels off a plane: and a share of its fall
+_UNKNOWN = 10000  # level of what is no plane
+_STEEP = 3  # levels a pixel that a plane falls at most
+_WORST = np.uint16(255)
+# Penalties for a change by one level, and by more: less, from _JUMP to _EDGE, where grey changes.
+_STEP, _JUMP, _EDGE, _EDGE_GREY = 10, 300, 80, 8
+
+
+@dataclass(frozen=True)
+class Swept:
+    """Inverse range on the shrunk polar grid, 1/m, and the distance of its levels there, 1/m."""
+
+    rho: Map
+    step: Map
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """References on polar grids of their own: one after the other, (references, rows, columns).
+
+    row, column : where each pixel of the current grid is seen if it is far away
+    table : (references, columns, levels) column that a column moves to at a level
+    used : (references,) number of levels at which a reference takes part
+    """
+
+    census: Census
+    contrast: Bytes
+    row: Map
+    column: Map
+    table: Map
+    used: NDArray[np.int64]
+
+
+@kernel
+def _cost_rows(first: int, last: int, census: Census, contrast: Bytes, seen_census: Census,
+               seen_contrast: Bytes, row: Map, column: Map, table: Map, used: NDArray[np.int64],
+               known: Map, cost: Bytes) -> None:  # pragma: no cover - compiled
+    """Mean of the two least costs of a level, (rows, columns, levels), and what holds it."""
+    count, rows, columns = seen_census.shape
+    half = np.float32(0.5)
+    least, second, found = (np.empty(cost.shape[2], np.uint16), np.empty(cost.shape[2], np.uint16),
+                            np.empty(cost.shape[2], np.uint16))
+    for i in range(first, last):
+        for j in range(census.shape[1]):
+            here, grey = census[i, j], np.int32(contrast[i, j])
+            least[:] = _WORST
+            second[:] = _WORST
+            for n in range(count):
+                r = min(max(int(row[n, i, j] + half), 0), rows - 1)
+                at = min(max(int(column[n, i, j] + half), 0), table.shape[1] - 1)
+                offset = column[n, i, j] - np.float32(at) + half
+                for k in range(used[n]):
+                    c = min(max(int(table[n, at, k] + offset), 0), columns - 1)
+                    bits = 2 * _different_bits(here, seen_census[n, r, c])
+                    off = int(abs(grey - np.int32(seen_contrast[n, r, c])) * _CONTRAST) >> 3
+                    found[k] = np.uint16(bits + min(off, _CONTRAST_LIMIT))
+                for k in range(used[n]):  # a loop of its own runs in vectors
+                    second[k] = min(second[k], max(least[k], found[k]))
+                    least[k] = min(least[k], found[k])
+            for k in range(cost.shape[2]):
+                other = second[k] if second[k] != _WORST else least[k]
+                away = min(abs(np.float32(k) - known[i, j]) * np.float32(1 / _HELD),
+                           np.float32(1))
+                held = np.int32(away * np.float32(_HOLD) + half)
+                cost[i, j, k] = np.uint8(np.int32(least[k]) + np.int32(other) + held)
+
+
+@kernel
+def _fall(plane: Levels, i: int, j: int, ip: int, jp: int) -> int:  # pragma: no cover - compiled
+    fall = plane[i, j] - plane[ip, jp]
+    return fall if abs(fall) <= _STEEP else 0
+
+
+@kernel
+def _jump(image: Image8, i: int, j: int, ip: int, jp: int) -> int:  # pragma: no cover - compiled
+    step = int(abs(np.int32(image[i, j]) - np.int32(image[ip, jp])))
+    return max(_EDGE, _JUMP * _EDGE_GREY // (_EDGE_GREY + step))
+
+
+@kernel
+def _advance(cost: Bytes, before: NDArray[np.uint16], least: np.uint16, jump: int,
+             total: NDArray[np.uint16],
+             now: NDArray[np.uint16]) -> np.uint16:  # pragma: no cover - compiled
+    """One pixel further along a path: its costs `now`, added to `total`; returns the least.
+
+    before : begins one level before the first
+    """
+    limit = np.uint16(least + jump)
+    lowest = np.uint16(65535)
+    for k in range(cost.size):
+        a = before[k + 1]
+        b = min(before[k], before[k + 2]) + _STEP
+        a = min(min(a, b), limit)
+        v = np.uint16(cost[k] + a - least)
+        now[k] = v
+        total[k] += v
+        lowest = min(lowest, v)
+    return lowest
+
+
+@kernel
+def _along_rows(first: int, last: int, cost: Bytes, image: Image8, plane: Levels,
+                total: Volume) -> None:  # pragma: no cover - compiled
+    columns, count = cost.shape[1], cost.shape[2]
+    side = _STEEP + 1
+    path = np.empty((2, count + 2 * side), np.uint16)
+    for i in range(first, last):
+        for way in range(2):
+            path[:] = _FREE
+            path[0, side:-side] = 0
+            least = np.uint16(0)
+            for n in range(columns):
+                j = n if way == 0 else columns - 1 - n
+                jp = max(j - 1, 0) if way == 0 else min(j + 1, columns - 1)
+                at = _STEEP - _fall(plane, i, j, i, jp)
+                least = _advance(cost[i, j], path[n % 2, at:], least, _jump(image, i, j, i, jp),
+                                 total[i, j], path[1 - n % 2, side:])
+
+
+@kernel
+def _across_rows(first: int, last: int, cost: Bytes, image: Image8, plane: Levels, slant: int,
+                 total: Volume) -> None:  # pragma: no cover - compiled
+    """Down and up the rows, each path shifting `slant` columns a row, within some columns."""
+    rows, count = cost.shape[0], cost.shape[2]
+    side = _STEEP + 1
+    a = np.empty((last - first, count + 2 * side), np.uint16)
+    b = np.empty((last - first, count + 2 * side), np.uint16)
+    b[:] = _FREE
+    least, lowest = np.empty(last - first, np.uint16), np.empty(last - first, np.uint16)
+    for way in range(2):
+        a[:] = _FREE
+        a[:, side:-side] = 0
+        least[:] = 0
+        for n in range(rows):
+            i = n if way == 0 else rows - 1 - n
+            ip = max(i - 1, 0) if way == 0 else min(i + 1, rows - 1)
+            for j in range(first, last):
+                jp = j - slant if way == 0 else j + slant
+                jp = min(max(jp, first), last - 1)
+                at = _STEEP - _fall(plane, i, j, ip, jp)
+                lowest[j - first] = _advance(
+                    cost[i, j], a[jp - first, at:], least[jp - first],
+                    _jump(image, i, j, ip, jp), total[i, j], b[j - first, side:])
+            a, b = b, a
+            least, lowest = lowest, least
+
+
+def planes(known: Map) -> Levels:
+    """Level (int32) of the plane round each pixel, or _UNKNOWN where it is none.
+
+    known : levels, not whole
+    """
+    size = 2 * _PLANE + 1
+    offset = np.arange(-_PLANE, _PLANE + 1, dtype=np.float32)
+    square = float((offset * offset).mean())
+    flat, rise = np.full(size, 1 / size, np.float32), offset / np.float32(size * square)
+    mean: Map = np.asarray(cv2.blur(known, (size, size)))
+    along, across = cv2.sepFilter2D(known, -1, rise, flat), cv2.sepFilter2D(known, -1, flat, rise)
+    falls = along * along + across * across
+    rest = cv2.blur(known * known, (size, size)) - mean * mean - falls * np.float32(square)
+    allowed = np.float32(_FLAT) + np.float32(_BEND * _PLANE) * np.sqrt(falls)
+    level: Levels = np.rint(mean).astype(np.int32)
+    level[rest >= allowed * allowed] = _UNKNOWN
+    return level
+
+
+def _fine_levels(baselines: Sequence[float], pixel: float) -> Floats:
+    """Levels that reach as near as they should, as fine as their number allows."""
+    step = _LEVEL
+    found = levels(baselines, pixel, step)
+    while len(found) == MOST_LEVELS:
+        step *= _COARSER
+        found = levels(baselines, pixel, step)
+    return found
+
+
+def _seen(references: Sequence[tuple[Image8, RelativePose]], half: PolarGrid, axes: Floats,
+          by: int, level: Floats) -> _Seen:
+    own_grid = PolarGrid(half.height, _MARGIN, _MARGIN)
+    count, theta, azimuth = len(references), half.theta(), half.azimuth()
+    census = np.empty((count, *own_grid.shape), np.uint32)
+    contrast = np.empty((count, *own_grid.shape), np.uint8)
+    row, column = (np.empty((count, *half.shape), np.float32) for _ in range(2))
+    for n, (image, pose) in enumerate(references):
+        small, own_axes = _shrunk(image, by), polar_axes(pose.direction)
+        view = _view(np.asarray(resample(with_border(small), polar_map(
+            own_grid, pose.rotation.T @ own_axes, small.shape)), np.uint8))
+        census[n], contrast[n] = view.census, view.contrast
+        parts = [np.ascontiguousarray(a, np.float32) for a in (
+            np.cos(theta), np.sin(theta), np.cos(azimuth), np.sin(azimuth), own_axes.T @ axes)]
+        rows_in_parallel(_place_rows, half.shape[0], *parts, np.float32(1 / half.pixel),
+                         np.float32(own_grid.margin - 0.5), row[n], column[n])
+    nearest = references[0][1].baseline
+    used = np.array([level.size if p.baseline == nearest
+                     else np.searchsorted(level, REACH / p.baseline) for _, p in references])
+    table = np.stack([_polar_table(own_grid, level, p.baseline) for _, p in references])
+    return _Seen(census, contrast, row, column, table, used)
+
+
+def guided_sweep(current: Image8, grid: PolarGrid, axes: Floats,
+                 references: Sequence[tuple[Image8, RelativePose]], known: Map) -> Swept:
+    """Inverse range on the current view's polar grid, shrunk by `reduction` (to half as a rule).
+
+    Parameters
+    ----------
+    current, grid, axes, references : as for `sweep`
+    known : 1/m, of grid.shape, what is known so far
+
+    """
+    by = reduction(grid.height)
+    half = PolarGrid(grid.height // by, grid.margin // by, grid.wrap // by)
+    view = _view(_shrunk(current, by))
+    level = _fine_levels([p.baseline for _, p in references], half.pixel)
+    seen = _seen(references, half, axes, by, level)
+    small = cv2.resize(known, half.shape[::-1], interpolation=cv2.INTER_AREA)
+    number = np.arange(level.size)
+    cost = np.empty((*half.shape, level.size), np.uint8)
+    rows_in_parallel(_cost_rows, len(cost), view.census, view.contrast, seen.census,
+                     seen.contrast, seen.row, seen.column, seen.table, seen.used,
+                     np.interp(small, level, number).astype(np.float32), cost)
+    smooth = np.interp(cv2.medianBlur(small, 5), level, number).astype(np.float32)
+    plane, total = planes(smooth), np.zeros(cost.shape, np.uint16)
+    rows_in_parallel(_along_rows, len(cost), cost, view.image, plane, total)
+    for slant in (0, 1, -1):
+        rows_in_parallel(_across_rows, cost.shape[1], cost, view.image, plane, slant, total,
+                         pieces=_BANDS)
+    out = np.empty(half.shape, np.float32)
+    rows_in_parallel(_winner_rows, len(total), total, level.astype(np.float32), out)
+    out = np.asarray(cv2.medianBlur(out, 3))
+    step = np.interp(out, level[:-1], np.diff(level)).astype(np.float32)
+    return Swept(out, step)
