@@ -30,7 +30,9 @@ from .sweep import (
     Census,
     Floats,
     Volume,
+    _advance,
     _different_bits,
+    _jump,
     _place_rows,
     _polar_table,
     _shrunk,
@@ -52,8 +54,8 @@ _PLANE, _FLAT, _BEND = 12, 1.5, 0.15  # px round about; levels off a plane: and 
 _UNKNOWN = 10000  # level of what is no plane
 _STEEP = 3  # levels a pixel that a plane falls at most
 _WORST = np.uint16(255)
-# Penalties for a change by one level, and by more: less, from _JUMP to _EDGE, where grey changes.
-_STEP, _JUMP, _EDGE, _EDGE_GREY = 10, 300, 80, 8
+# Penalties for a change by more than a level: less, from _JUMP to _EDGE, where grey changes.
+_JUMP, _EDGE = 300, 80
 
 
 @dataclass(frozen=True)
@@ -122,33 +124,6 @@ def _fall(plane: Levels, i: int, j: int, ip: int, jp: int) -> int:  # pragma: no
 
 
 @kernel
-def _jump(image: Image8, i: int, j: int, ip: int, jp: int) -> int:  # pragma: no cover - compiled
-    step = int(abs(np.int32(image[i, j]) - np.int32(image[ip, jp])))
-    return max(_EDGE, _JUMP * _EDGE_GREY // (_EDGE_GREY + step))
-
-
-@kernel
-def _advance(cost: Bytes, before: NDArray[np.uint16], least: np.uint16, jump: int,
-             total: NDArray[np.uint16],
-             now: NDArray[np.uint16]) -> np.uint16:  # pragma: no cover - compiled
-    """One pixel further along a path: its costs `now`, added to `total`; returns the least.
-
-    before : begins one level before the first
-    """
-    limit = np.uint16(least + jump)
-    lowest = np.uint16(65535)
-    for k in range(cost.size):
-        a = before[k + 1]
-        b = min(before[k], before[k + 2]) + _STEP
-        a = min(min(a, b), limit)
-        v = np.uint16(cost[k] + a - least)
-        now[k] = v
-        total[k] += v
-        lowest = min(lowest, v)
-    return lowest
-
-
-@kernel
 def _along_rows(first: int, last: int, cost: Bytes, image: Image8, plane: Levels,
                 total: Volume) -> None:  # pragma: no cover - compiled
     columns, count = cost.shape[1], cost.shape[2]
@@ -163,8 +138,9 @@ def _along_rows(first: int, last: int, cost: Bytes, image: Image8, plane: Levels
                 j = n if way == 0 else columns - 1 - n
                 jp = max(j - 1, 0) if way == 0 else min(j + 1, columns - 1)
                 at = _STEEP - _fall(plane, i, j, i, jp)
-                least = _advance(cost[i, j], path[n % 2, at:], least, _jump(image, i, j, i, jp),
-                                 total[i, j], path[1 - n % 2, side:])
+                jump = _jump(image, i, j, i, jp, _JUMP, _EDGE)
+                least = _advance(cost[i, j], path[n % 2, at:], least, jump, total[i, j],
+                                 path[1 - n % 2, side - 1:])
 
 
 @kernel
@@ -190,7 +166,7 @@ def _across_rows(first: int, last: int, cost: Bytes, image: Image8, plane: Level
                 at = _STEEP - _fall(plane, i, j, ip, jp)
                 lowest[j - first] = _advance(
                     cost[i, j], a[jp - first, at:], least[jp - first],
-                    _jump(image, i, j, ip, jp), total[i, j], b[j - first, side:])
+                    _jump(image, i, j, ip, jp, _JUMP, _EDGE), total[i, j], b[j - first, side - 1:])
             a, b = b, a
             least, lowest = lowest, least
 

@@ -172,10 +172,10 @@ def _advance(cost: NDArray[np.uint8], before: NDArray[np.uint16], least: np.uint
 
 
 @kernel
-def _jump(image: Image8, i: int, j: int, ip: int,
-          jp: int) -> int:  # pragma: no cover - compiled
+def _jump(image: Image8, i: int, j: int, ip: int, jp: int, jump: int,
+          edge: int) -> int:  # pragma: no cover - compiled
     step = int(abs(np.int32(image[i, j]) - np.int32(image[ip, jp])))
-    return max(_EDGE, _JUMP * _EDGE_GREY // (_EDGE_GREY + step))
+    return max(edge, jump * _EDGE_GREY // (_EDGE_GREY + step))
 
 
 @kernel
@@ -191,7 +191,8 @@ def _along_rows(first: int, last: int, cost: NDArray[np.uint8], image: Image8,
             for n in range(columns):
                 j = n if way == 0 else columns - 1 - n
                 jp = max(j - 1, 0) if way == 0 else min(j + 1, columns - 1)
-                least = _advance(cost[i, j], a, least, _jump(image, i, j, i, jp), total[i, j], b)
+                jump = _jump(image, i, j, i, jp, _JUMP, _EDGE)
+                least = _advance(cost[i, j], a, least, jump, total[i, j], b)
                 a, b = b, a
 
 
@@ -213,8 +214,9 @@ def _across_rows(first: int, last: int, cost: NDArray[np.uint8], image: Image8, 
             for j in range(first, last):
                 jp = j - slant if way == 0 else j + slant
                 jp = min(max(jp, first), last - 1)
-                lowest[j - first] = _advance(cost[i, j], a[jp - first], least[jp - first],
-                                             _jump(image, i, j, ip, jp), total[i, j], b[j - first])
+                jump = _jump(image, i, j, ip, jp, _JUMP, _EDGE)
+                lowest[j - first] = _advance(cost[i, j], a[jp - first], least[jp - first], jump,
+                                             total[i, j], b[j - first])
             a, b = b, a
             least, lowest = lowest, least
 
