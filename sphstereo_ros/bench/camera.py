@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import struct
 import time
 from collections.abc import Callable, Sequence
@@ -97,6 +98,8 @@ def main() -> int:
     parser.add_argument('--sent', type=Path, required=True, help='file for the stamps')
     arguments = parser.parse_args()
     prepare_process()
+    # A process that a shell put into the background starts with it ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
     node = rclpy.create_node('camera')
     name, kind = (('image/compressed', 'CompressedImage') if arguments.encoding == 'jpeg'
