@@ -10,10 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import numpy as np
 
 from sphstereo_ros.core.frames import Drop, FrameKey, Image8
 from sphstereo_ros.replay import bag_messages
 from sphstereo_ros.replay.records import COMPRESSED, FIRST_STAMP, IMAGE, BadInput, Record
+from sphstereo_ros.replay.spherical_metadata import read_layout
 from sphstereo_ros.ros.conversions import compressed_message, image_message
 from sphstereo_ros.ros.images import compressed_size, wrong_size
 
@@ -42,6 +44,7 @@ class Video:
     def __init__(self, path: Path, fps: float = 0.0, start: float = 0.0,
                  end: float = math.inf) -> None:
         self._path, self._fps, self._start, self._end = path, fps, start, end
+        self._layout = read_layout(path)
         capture = self._open()
         reported = float(capture.get(cv2.CAP_PROP_FPS))
         self._total = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
@@ -49,7 +52,9 @@ class Video:
         capture.release()
         if not good or first is None:
             raise BadInput(f'{path} holds no picture that can be read')
-        self.height, self.width = first.shape[:2]
+        if self._layout.problem:
+            raise BadInput(f'{path}: {self._layout.problem}, as its metadata tells')
+        self.height, self.width = self._layout.one_eye(np.asarray(first, np.uint8)).shape[:2]
         drop = wrong_size(self.height, self.width)
         if drop is not None:
             raise BadInput(f'{path}: {self.width}×{self.height} is no full sphere, which is twice '
@@ -87,7 +92,8 @@ class Video:
                 good, image = capture.retrieve()
                 if not good or image is None:
                     break
-                yield VideoFrame(FIRST_STAMP + round(time * 1e9), image)
+                yield VideoFrame(FIRST_STAMP + round(time * 1e9),
+                                 self._layout.one_eye(np.asarray(image, np.uint8)))
         finally:
             capture.release()
         if index < 0.98 * self._total - 2:
