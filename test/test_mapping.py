@@ -163,6 +163,15 @@ def test_ground_scale_is_exact_and_says_where_there_is_none():
     assert ground_scale(nothing, config, 1.6) is None
 
 
+@pytest.mark.parametrize('dip', [60, 40, 30])
+def test_ground_that_is_not_seen_right_below_gives_the_scale_too(dip):
+    """The vehicle hides it, or two stills of paving tell nothing there."""
+    hidden = image(3, 0.5).range.copy()
+    hidden[round((0.5 + dip / 180) * HEIGHT):] = np.nan
+    assert ground_scale(image(3, range=hidden), resolve({}).camera, 1.6) == pytest.approx(
+        0.5, rel=0.02)
+
+
 def test_only_what_is_seen_often_and_sharply_is_kept():
     submap = mapped(resolve(METRES))
     config = resolve({'mapping.min_frames': 4, 'mapping.max_sigma': 0.02}).mapping

@@ -16,8 +16,11 @@ from .rotations import mount
 Floats = NDArray[np.float64]
 
 _STEP = 4  # every so many pixels and rows
-_DIP, _STEEP = 0.05, 0.7  # sine of the angle below the horizon: of ground, and of a first look
+_DIP = 0.05  # sine of the angle below the horizon of ground
+# The same of a first look: straight down nothing but ground is seen, where anything is.
+_STEEP = (0.7, 0.5, 0.35, 0.2)
 _ENOUGH = 50
+_ROUNDS, _SETTLED = 5, 0.02  # of the logarithm: a plane that each look tells anew is no ground
 _SIGMA = 0.1  # of a range, as a share of it, at most
 # Standard deviation of the logarithm of a height: roads are arched, vehicles rock.
 HEIGHT_SIGMA = 0.03
@@ -46,16 +49,23 @@ def ground_scale(image: RangeImage, camera: CameraConfig, height: float,
         known = np.isfinite(r) & (r > 0) & (sigma < _SIGMA * r) & (bearings[..., 2] < -_DIP)
     r, bearings = r[known].astype(np.float64), bearings[known]
     if scale is None:
-        depth = -r * bearings[:, 2]
-        steep = bearings[:, 2] < -_STEEP
-        if steep.sum() < _ENOUGH:
-            return None
-        scale = height / float(np.median(depth[steep]))
-    for _ in range(2):  # what is ground and what is not is told in metres
+        scale = _first_look(-bearings[:, 2], r, height)
+    for _ in range(_ROUNDS if scale else 0):  # what is ground and what is not is told in metres
         points = (scale * r[:, None] * bearings).astype(np.float32)
         ground = find_ground(points, np.zeros(3))
         if ground is None:
             return None
-        found = -ground.height / math.hypot(1.0, *ground.slope)
-        scale *= height / found
-    return scale
+        change = height * math.hypot(1.0, *ground.slope) / -ground.height
+        scale *= change
+        if abs(math.log(change)) < _SETTLED:
+            return scale
+    return None
+
+
+def _first_look(dip: Floats, r: Floats, height: float) -> float | None:
+    """Of the steepest points, if there are enough."""
+    for least in _STEEP:
+        steep = dip > least
+        if steep.sum() >= _ENOUGH:
+            return height / float(np.median((dip * r)[steep]))
+    return None
