@@ -3,8 +3,10 @@ from __future__ import annotations
 
 import builtins
 import importlib
+import os
 import re
 import runpy
+import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
@@ -123,3 +125,15 @@ def test_pins_name_every_dependency_once(setup: dict[str, Any]) -> None:
     wanted = [*setup['install_requires'], *(r for extra in setup['extras_require'].values()
                                             for r in extra)]
     assert {re.split(r'[<>=]', r)[0].lower() for r in wanted} <= set(names)
+
+
+@pytest.mark.parametrize('given', [None, '3'])
+def test_blas_has_one_thread_unless_told(given):
+    environment = {k: v for k, v in os.environ.items() if k != 'OPENBLAS_NUM_THREADS'}
+    if given:
+        environment['OPENBLAS_NUM_THREADS'] = given
+    code = ('import sphstereo_ros, os, sys; assert "numpy" not in sys.modules; '
+            'print(os.environ["OPENBLAS_NUM_THREADS"])')
+    told = subprocess.run([sys.executable, '-c', code], env=environment, capture_output=True,
+                          text=True, check=True)
+    assert told.stdout.strip() == (given or '1')
