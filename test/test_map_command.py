@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import gc
 import os
 import resource
 import signal
 import subprocess
 import sys
 import time
+import tracemalloc
 import wave
 from pathlib import Path
 
@@ -17,11 +19,11 @@ from making_bags import write_bag, write_video
 
 from sphstereo_ros import cli
 from sphstereo_ros.core.config import resolve
-from sphstereo_ros.core.frames import FrameKey, PointCloud
+from sphstereo_ros.core.frames import Frame, FrameKey, PointCloud
 from sphstereo_ros.core.rotations import exp
 from sphstereo_ros.replay import map_cluster, map_run
 from sphstereo_ros.replay.bag_messages import make
-from sphstereo_ros.replay.map_chunks import Division, Recording
+from sphstereo_ros.replay.map_chunks import Division, Recording, chunks_of
 from sphstereo_ros.replay.map_files import load_cloud, save_cloud, track_lines
 from sphstereo_ros.replay.records import BadInput
 from sphstereo_ros.replay.sources import open_source
@@ -305,6 +307,31 @@ def test_two_stills_make_a_map_and_an_empty_one_is_refused(tmp_path, capsys):
     np.testing.assert_allclose(np.loadtxt(out.with_suffix('.tum'))[:, 1], [0, STEP], atol=1e-6)
 
 
+def test_two_stills_from_beside_each_other_make_a_map(tmp_path):
+    """The way is across the picture: to the right."""
+    bag = write_bag(tmp_path / 'bag', [('/image', key.stamp, convert.frame_message(
+        make, Frame(key, room.view(np.array([3 * STEP * k, 0, 0]), np.eye(3), HEIGHT)[0])))
+        for k, key in enumerate(FrameKey(10**9 + k * 10**8, 'camera') for k in range(2))])
+    out = tmp_path / 'map.ply'
+    assert command(bag, '--out', out, *FAST, '-p', f'baseline.length:={3 * STEP}', '-p',
+                   'mapping.min_frames:=1') == 0
+    np.testing.assert_allclose(np.loadtxt(out.with_suffix('.tum'))[1, 1:4], [0, -3 * STEP, 0],
+                               atol=0.01)
+    assert len(load_cloud(out).xyz) > 500
+
+
+def test_why_there_is_no_map_is_told(tmp_path, capsys):
+    """The same still twice."""
+    image = room.forward(1, STEP, HEIGHT)[0].image
+    bag = write_bag(tmp_path / 'bag', [('/image', key.stamp, convert.frame_message(
+        make, Frame(key, image))) for key in (FrameKey(10**9, 'a'), FrameKey(2 * 10**9, 'a'))])
+    assert command(bag, '--out', tmp_path / 'map.ply', '-p', 'baseline.length:=1.0') == 2
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) == 1
+    assert error[0].startswith('sphstereo map: no frame could be placed: no_parallax: ')
+    assert 'first_frame' not in error[0]
+
+
 def test_several_inputs_become_one_map(tmp_path, whole):
     """Two halves of one drive, as two bags."""
     frames = room.forward(COUNT, STEP, HEIGHT)
@@ -320,6 +347,22 @@ def test_several_inputs_become_one_map(tmp_path, whole):
     track = np.loadtxt(out.with_suffix('.tum'))
     assert len(track) == COUNT
     np.testing.assert_allclose(track[:, 1], STEP * np.arange(COUNT), atol=0.03)
+
+
+def test_one_chunk_after_the_other_keeps_no_more(bag):
+    """Not one of the frames that went by."""
+    config = resolve({'stereo.matcher': 'bm', 'baseline.source': 'odometry',
+                      'mapping.max_points': 10_000})
+    sizes = []
+    tracemalloc.start()
+    for _ in chunks_of(Recording(bag, open_source(bag), '/image'), config, Division(6, LEAD),
+                       lambda _: True):
+        gc.collect()
+        sizes.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    frame = 2 * HEIGHT * HEIGHT
+    assert len(sizes) == 4
+    assert sizes[3] - sizes[1] < 3 * frame, np.diff(sizes) / frame
 
 
 # Many machines

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import pickle
 import sys
 from functools import cache
 
@@ -28,7 +29,7 @@ from sphstereo_ros.core.mapping import (
 from sphstereo_ros.core.motion import OdometrySample
 from sphstereo_ros.core.registration import registered
 from sphstereo_ros.core.submaps import MapBuilder
-from sphstereo_ros.core.track import TrackedFrame
+from sphstereo_ros.core.track import Track, TrackedFrame
 
 HEIGHT, STEP, PERIOD, COUNT = 100, 0.1, 33_333_333, 16
 METRES = {'baseline.source': 'odometry', 'mapping.min_frames': 2}
@@ -118,9 +119,26 @@ def test_with_a_lag_the_map_is_nearly_the_same():
     live = Mapper(resolve(METRES), lag=3, first=RelativePose(start.rotation, start.position))
     for k in range(1, COUNT):
         live.add(window(k), image(k))
-        assert len(live.fused) == max(0, k - 3)
+        assert live.fused == max(0, k - 3)
     whole = mapped(resolve(METRES))
     assert len(live.finish().points) == pytest.approx(len(whole.points), rel=0.01)
+
+
+def test_a_map_that_goes_on_keeps_no_more():
+    """Forth and back for long: all of the mapper's state stays as large."""
+    live = Mapper(resolve({**METRES, 'mapping.max_points': 5000}), lag=3)
+    live.track = Track(first_pose(resolve({})), keep=12)
+    order = [COUNT - 1 - abs(COUNT - 1 - k % (2 * COUNT - 2)) for k in range(101)]
+    sizes = []
+    for k in range(1, len(order)):
+        references = tuple(Reference(Frame(key(n), views()[0].image), true_pose(
+            views()[order[n]], views()[order[k]])) for n in (k - 1, k - 4) if n >= 0)
+        measured = RangeImage(key(k), image(order[k]).range, image(order[k]).sigma, True)
+        placed = live.add(AlignedWindow(Frame(key(k), views()[0].image), references), measured)
+        assert not isinstance(placed, Drop)
+        sizes.append(len(pickle.dumps(live)))
+    assert live.fused == len(sizes) - 3
+    assert max(sizes[60:]) < 1.001 * max(sizes[:60])
 
 
 def test_without_any_scale_there_is_no_map():

@@ -129,7 +129,7 @@ def mapped(bag: Path, values: Mapping[str, object], folder: Path,
     run.remove_chunks()
     count = max(run.summary.frames, 1)
     if not track:
-        raise BadInput(f'no frame could be placed ({", ".join(run.summary.drops)})')
+        raise BadInput(f'no frame could be placed: {run.summary.why_not()}')
     return track, points, {'frame_s': (time.perf_counter() - wall) / count,
                            'frame_cpu_s': (time.process_time() - cpu) / count}
 

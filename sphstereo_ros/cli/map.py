@@ -88,8 +88,7 @@ def _mapped(run: MapRun, out: Path, dask: str | None) -> int:
     frames, points = run.join()
     if not frames:
         run.remove_chunks()
-        causes = ', '.join(run.summary.drops) or 'too few frames'
-        raise BadInput(f'no frame could be placed ({causes})')
+        raise BadInput(f'no frame could be placed: {run.summary.why_not()}')
     if not len(points):
         run.remove_chunks()
         limits = run.config.mapping

@@ -123,7 +123,7 @@ class Mapper:
                            keep=4 * lag and max(4 * lag, 150))
         self.voxels = VoxelMap(config.mapping.voxel, config.mapping.max_points)
         self._waiting: deque[_Scan] = deque()
-        self._fused: list[TrackedFrame] = []
+        self._fused = 0
         self._count = 0
         self._scale: float | None = None
         self._steps: list[tuple[FrameKey, float]] = []
@@ -168,12 +168,12 @@ class Mapper:
         return placed
 
     def finish(self) -> Submap:
-        """All that waits is fused; what has become of all frames."""
+        """All that waits is fused; what has become of all frames, or with a lag, of the newest."""
         if not self._lag:
             self.track.adjust_all()
         while self._waiting:
             self._fuse(self._waiting.popleft())
-        frames = self._fused if self._lag else self.track.frames
+        frames = self.track.frames
         if not self._free or self._by_height:
             return Submap(frames, self.voxels.points())
         return Submap(frames, self.voxels.points(), sum(step for _, step in self._steps),
@@ -198,8 +198,8 @@ class Mapper:
         self._count = 0
 
     @property
-    def fused(self) -> list[TrackedFrame]:
-        """The frames whose points are in the map."""
+    def fused(self) -> int:
+        """How many frames have their points in the map."""
         return self._fused
 
     def _scale_by_ground(self, image: RangeImage) -> float | None:
@@ -242,8 +242,8 @@ class Mapper:
         placed = self.track[scan.key]
         turn = (placed.scale * placed.rotation).astype(np.float32)
         xyz = scan.xyz @ turn.T + placed.position.astype(np.float32)
-        self.voxels.add(xyz, scan.sigma * np.float32(placed.scale), scan.bgr, len(self._fused))
-        self._fused.append(placed)
+        self.voxels.add(xyz, scan.sigma * np.float32(placed.scale), scan.bgr, self._fused)
+        self._fused += 1
 
 
 def confirmed(points: VoxelPoints, config: MappingConfig) -> VoxelPoints:

@@ -104,6 +104,7 @@ class ChunkMapper:
     def _drop(self, drop: Drop) -> None:
         if self._begins is not None or self._at_start:  # else it is counted in the chunk before
             self.chunk.drops[drop.cause] += 1
+            self.chunk.details[drop.cause] = drop.detail
 
     def _take(self, results: Sequence[StageResults | Drop]) -> None:
         for result in results:

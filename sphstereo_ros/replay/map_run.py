@@ -35,6 +35,7 @@ from sphstereo_ros.ros.messages import SECOND
 
 CHUNK, LEAD = 120, 24  # frames
 _NEXT = SECOND // 30  # between two recordings whose stamps do not tell
+_EXPECTED = ('first_frame', 'rate_limit')
 
 
 @dataclass
@@ -47,7 +48,14 @@ class MapSummary:
     length: float = 0.0
     resumed: int = 0
     drops: Counter[str] = field(default_factory=Counter)
+    details: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
+
+    def why_not(self) -> str:
+        """Why frames were dropped, in words; what is expected only where there is nothing else."""
+        causes = [c for c, _ in self.drops.most_common() if c not in _EXPECTED]
+        return '; '.join(f'{c}: {self.details[c]}' if self.details.get(c) else c
+                         for c in causes) or 'too few frames'
 
     def lines(self) -> list[str]:
         """One line a figure."""
@@ -153,6 +161,7 @@ class MapRun:
                 done = load_chunk(path)
                 self.summary.frames += done.frames
                 self.summary.drops.update(done.drops)
+                self.summary.details.update(done.details)
                 if done.problem:
                     self.summary.problems.append(f'{recording.path}: {done.problem}')
                 for segment in done.segments:

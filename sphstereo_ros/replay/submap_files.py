@@ -16,7 +16,7 @@ from sphstereo_ros.core.voxels import VoxelPoints
 from sphstereo_ros.replay.map_files import written_whole
 from sphstereo_ros.replay.records import BadInput
 
-_VERSION = 2
+_VERSION = 3
 _POINTS = ('xyz', 'bgr', 'frames', 'points', 'weight', 'level')
 
 
@@ -30,10 +30,14 @@ class Segment:
 
 @dataclass
 class Chunk:
-    """What became of some consecutive frames: one segment if the track was never lost."""
+    """What became of some consecutive frames: one segment if the track was never lost.
+
+    drops : how many of each cause; details : what the last of each cause told
+    """
 
     segments: list[Segment] = field(default_factory=list)
     drops: Counter[str] = field(default_factory=Counter)
+    details: dict[str, str] = field(default_factory=dict)
     frames: int = 0
     problem: str = ''
 
@@ -41,8 +45,8 @@ class Chunk:
 def save_chunk(path: Path, chunk: Chunk) -> None:
     """Write a chunk, whole or not at all; BadInput where it cannot be written."""
     arrays: dict[str, Any] = {}
-    told: dict[str, Any] = {'version': _VERSION, 'drops': chunk.drops, 'frames': chunk.frames,
-                            'problem': chunk.problem, 'segments': []}
+    told: dict[str, Any] = {'version': _VERSION, 'drops': chunk.drops, 'details': chunk.details,
+                            'frames': chunk.frames, 'problem': chunk.problem, 'segments': []}
     for n, segment in enumerate(chunk.segments):
         submap = segment.submap
         frames = submap.frames
@@ -82,7 +86,8 @@ def load_chunk(path: Path) -> Chunk:
             segments = [_segment(data, n, more) for n, more in enumerate(told['segments'])]
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise BadInput(f'{path} is no finished chunk: {error}') from error
-    return Chunk(segments, Counter(told['drops']), told['frames'], told['problem'])
+    return Chunk(segments, Counter(told['drops']), told['details'], told['frames'],
+                 told['problem'])
 
 
 def _segment(data: Any, n: int, told: dict[str, Any]) -> Segment:
