@@ -50,7 +50,9 @@ def ground_scale(image: RangeImage, camera: CameraConfig, height: float,
     r, bearings = r[known].astype(np.float64), bearings[known]
     if scale is None:
         scale = _first_look(-bearings[:, 2], r, height)
-    for _ in range(_ROUNDS if scale else 0):  # what is ground and what is not is told in metres
+        if scale is None:
+            return None
+    for _ in range(_ROUNDS):  # what is ground and what is not is told in metres
         points = (scale * r[:, None] * bearings).astype(np.float32)
         ground = find_ground(points, np.zeros(3))
         if ground is None:
