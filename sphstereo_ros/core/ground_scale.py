@@ -44,10 +44,10 @@ def ground_scale(image: RangeImage, camera: CameraConfig, height: float,
     """
     bearings = _below(len(image.range), camera)
     thin = (slice(None, None, _STEP), slice(None, None, _STEP))
-    r, sigma = image.range[thin], image.sigma[thin]
+    r, sigma = image.range[thin].astype(np.float64), image.sigma[thin]
     with np.errstate(invalid='ignore'):
         known = np.isfinite(r) & (r > 0) & (sigma < _SIGMA * r) & (bearings[..., 2] < -_DIP)
-    r, bearings = r[known].astype(np.float64), bearings[known]
+    r, bearings = r[known], bearings[known]
     if scale is None:
         scale = _first_look(-bearings[:, 2], r, height)
         if scale is None:
