@@ -5,6 +5,7 @@ shared folder.
 """
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import import_module
@@ -52,7 +53,8 @@ def cluster(address: str) -> Iterator[Any]:
         raise BadInput(f'--dask: {address} is not local:N')
     with distributed.LocalCluster(
             n_workers=count, threads_per_worker=1, processes=True, host='127.0.0.1',
-            dashboard_address=None, memory_limit=0) as local, distributed.Client(local) as client:
+            dashboard_address=None, memory_limit=0,
+            silence_logs=logging.ERROR) as local, distributed.Client(local) as client:
         yield client
 
 
