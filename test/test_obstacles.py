@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sphstereo_ros.bench.methods import Method
 from sphstereo_ros.bench.obstacle_truth import true_sectors
-from sphstereo_ros.bench.obstacles import frames_of_bag
+from sphstereo_ros.bench.obstacles import ObstacleContest, frames_of_bag, sequence_line
 from sphstereo_ros.core.camera import Equirectangular
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.contact import time_to_contact
@@ -143,6 +144,16 @@ def test_a_wall_is_as_far_as_its_nearest_point_in_the_sector() -> None:
             assert out.distance[at] == pytest.approx(expected, rel=0.02)
         elif angle > 80:
             assert out.state[at] == SectorState.FREE
+
+
+@pytest.mark.parametrize(('low', 'high'), [(-1.5, -0.885), (0.885, 1.6)])
+def test_what_is_measured_too_far_does_not_leave_the_band(low: float, high: float) -> None:
+    """It reaches 11.5 cm into the band; 3 % farther along its rays that is 9."""
+    image = seen(floor(1.5), post(3, 0, 0.4, low, high), wall(9.0), height=960)
+    near = image.range < 4.2
+    image.range[near] *= 1.03
+    image.sigma[near] *= 1.03
+    assert detect(image).distance[sector_of(1, 0)] == pytest.approx(2.6 * 1.03, rel=0.02)
 
 
 def test_under_what_hangs_just_above_the_band_nothing_is_free() -> None:
@@ -353,6 +364,36 @@ def test_truth_agrees_with_closed_forms() -> None:
     assert truth[sector_of(1, 0)] == pytest.approx(6.0, rel=0.01)
     assert truth[sector_of(0, -1)] == pytest.approx(2.9, rel=0.01)
     assert truth[sector_of(-1, 0)] == np.inf
+
+
+def test_truth_has_what_is_beside_where_it_is_widened() -> None:
+    """Also behind, where the picture ends, and in the first sector."""
+    limits = resolve({}).obstacles
+    for turn in np.radians([180, -20]):
+        at = turn + np.radians([3.3, -3.3])  # beyond the edges of the sector at `turn`
+        image = seen(post(5 * np.cos(at[0]), -5 * np.sin(at[0]), 0.05),
+                     post(8 * np.cos(at[1]), -8 * np.sin(at[1]), 0.07))
+        sector = sector_of(np.cos(turn), -np.sin(turn))
+        found = [true_sectors(image.range.astype(float), OPTICAL_FROM_LINK.T, 1.5, limits,
+                              widened)[sector] for widened in (0.0, 1.2)]
+        assert found[0] == np.inf
+        assert found[1] == pytest.approx(4.95, rel=0.01)
+
+
+def test_what_one_sequence_gives_is_told_and_kept() -> None:
+    frames = list(frames_of_bag(Path(__file__).parents[1] / 'bags' / 'street.mcap'))[:3]
+    small = Method({'stereo.matcher': 'bm', 'pairing.intervals': [1],
+                    'stereo.working_height': 192})
+    contest = ObstacleContest({'small': small})
+    told = contest.add('one', frames[:2])
+    assert told['small']['frames'] == 1
+    line = sequence_line('one', 'small', told['small'])
+    assert line.startswith('one, small: 1 (')
+    assert f"nearer than 10 m {told['small']['near']}," in line
+    again = contest.add('one', frames[1:])
+    both = contest.summaries()['one']['small']
+    assert both['near'] == told['small']['near'] + again['small']['near'] > 20
+    assert both['frames'] == 2
 
 
 def test_the_sample_bag_is_read_with_its_truth() -> None:

@@ -177,13 +177,14 @@ def _binocular(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _obstacles(args: argparse.Namespace) -> dict[str, Any]:
-    from .obstacles import ObstacleContest, table
+    from .obstacles import ObstacleContest, sequence_line, table
     names = _chosen(args.methods, OBSTACLE_METHODS, OBSTACLE_METHODS)
     given = load_values(args.params, args.overrides)
     contest = ObstacleContest({name: method(name, given) for name in names}, args.ground)
     with tqdm(unit='frame', disable=None) as progress:
         for name, sequence in _obstacle_inputs(args):
-            contest.add(name, sequence, progress.update)
+            for label, summary in contest.add(name, sequence, progress.update).items():
+                progress.write(sequence_line(name, label, summary), file=sys.stderr)
     summaries = contest.summaries()
     print(table(summaries))
     return summaries

@@ -60,19 +60,22 @@ def true_sectors(distance: Floats, rotation: Floats, height_over_ground: float,
     finite = np.where(np.isfinite(distance), distance, 0.0)
     area = (finite**2 * solid_angle).ravel()
     x, y, z = level_points(finite, rotation).T
-    flat = np.hypot(x, y)
     counts = ((area > 0) & (z >= -limits.height_below) & (z <= limits.height_above)
               & (z > limits.ground_clearance - height_over_ground))
-    flat, area = flat[counts], area[counts]
-    clockwise = np.degrees(np.arctan2(-y, x))[counts]
+    x, y, area = x[counts], y[counts], area[counts]
+    # Clockwise from the edge of the first sector, sorted, and what comes before and after a turn.
+    turned = (np.degrees(np.arctan2(-y, x)) + 22.5) % 360
+    order = np.argsort(turned)
+    flat, area = (np.tile(a[order], 3) for a in (np.hypot(x, y), area))
+    turned = np.concatenate([turned[order] + turn for turn in (-360, 0, 360)])
     out = np.full(SECTORS, np.inf)
     for sector in range(SECTORS):
-        off = (clockwise - (-20 + 5 * sector) + 180) % 360 - 180
-        inside = np.abs(off) <= 2.5 + widened
-        order = np.argsort(flat[inside])
-        enough = np.cumsum(area[inside][order]) >= least
+        first = np.searchsorted(turned, 5 * sector - widened, 'left')
+        last = np.searchsorted(turned, 5 * sector + 5 + widened, 'right')
+        rising = first + np.argsort(flat[first:last])
+        enough = np.cumsum(area[rising]) >= least
         if enough.any():
-            out[sector] = flat[inside][order][np.argmax(enough)]
+            out[sector] = flat[rising][np.argmax(enough)]
     return out
 
 

@@ -77,10 +77,13 @@ class ObstacleContest:
         self._scores: dict[tuple[str, str], Score] = {}
 
     def add(self, name: str, sequence: Iterable[TruthFrame],
-            advance: Callable[[], object] = lambda: None) -> None:
-        """All methods over one sequence of the scene `name`; `advance` is called per frame."""
-        runs = [_Run(method, self._scores.setdefault((name, label), Score()))
-                for label, method in self._methods.items()]
+            advance: Callable[[], object] = lambda: None) -> dict[str, Mapping[str, Any]]:
+        """All methods over one sequence of the scene `name`; `advance` is called per frame.
+
+        Returns the figures of this sequence by method.
+        """
+        scores = {label: Score() for label in self._methods}
+        runs = [_Run(method, scores[label]) for label, method in self._methods.items()]
         for frame in sequence:
             truths: dict[Any, Sequence[np.ndarray[Any, Any]]] = {}
             for run in runs:
@@ -89,6 +92,9 @@ class ObstacleContest:
                     truths[limits] = self._truth(frame, run.config)
                 run.add(frame, truths[limits])
             advance()
+        for label, score in scores.items():
+            self._scores.setdefault((name, label), Score()).include(score)
+        return {label: score.summary() for label, score in scores.items()}
 
     def _truth(self, frame: TruthFrame, config: Config) -> Sequence[np.ndarray[Any, Any]]:
         height = float(frame.position[2]) - self._ground
@@ -157,6 +163,12 @@ def table(summaries: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
     rows = [[scene, label, _frames(s), *(_cell(s[name]) for name in _COLUMNS)]
             for scene, by_method in summaries.items() for label, s in by_method.items()]
     return markdown(['scene', 'method', 'frames (dropped)', *_COLUMNS.values()], rows)
+
+
+def sequence_line(scene: str, label: str, summary: Mapping[str, Any]) -> str:
+    """Of one sequence, as it is told while others are measured."""
+    figures = ', '.join(f'{title} {_cell(summary[name])}' for name, title in _COLUMNS.items())
+    return f'{scene}, {label}: {_frames(summary)} frames; {figures}'
 
 
 def _cell(value: float | None) -> str:

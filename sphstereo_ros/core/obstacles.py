@@ -36,6 +36,9 @@ _BODY = Hidden(1.0, 0.4, 10.0, 0.15, True, nearest=2.0)
 _BEFORE = 0.6
 # m above the band that must be free, too: a crown that begins there has leaves below it.
 _OVER = 0.5
+# By such a share of its height over and under the camera, the band is larger than it is asked to
+# be: range that is a little too large must not carry what stands near, and low in it, out of it.
+_LEEWAY = 0.03
 _DOUBT = 0.01  # m²: a sector with so much that is too small to be believed is not free
 _COLUMNS, _PIXELS_PER_COLUMN = 10, 1.3  # of a sector, at most, and where the image has as many
 _CELL = math.radians(1.0)  # height of the cells of `open_space`, at least
@@ -156,8 +159,11 @@ class _Picture:
     def _band(self, ground: Ground | None) -> Band:
         limits, measured = self._config.obstacles, self._config.range
         plane = (0.0, 0.0, -math.inf) if ground is None else (*ground.slope, ground.height)
-        return Band(limits.height_below, limits.height_above, limits.minimum, limits.maximum,
-                    limits.ground_clearance, measured.minimum, measured.maximum, plane)
+        up = float(self._camera[2])
+        below = limits.height_below + _LEEWAY * max(limits.height_below + up, 0.0)
+        above = limits.height_above + _LEEWAY * max(limits.height_above - up, 0.0)
+        return Band(below, above, limits.minimum, limits.maximum, limits.ground_clearance,
+                    measured.minimum, measured.maximum, plane)
 
 
 @lru_cache(maxsize=4)
