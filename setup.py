@@ -11,7 +11,7 @@ setup(
     name=NAME,
     version='0.1.0',
     packages=find_packages(exclude=['test', 'test.*']),
-    package_data={NAME: ['core/*.npz', 'ros/*.xml', 'report/web/*', 'py.typed']},
+    package_data={NAME: ['core/*.npz', 'core/*.onnx', 'ros/*.xml', 'report/web/*', 'py.typed']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
         (f'share/{NAME}', ['package.xml']),
@@ -30,6 +30,7 @@ setup(
         'map': ['small-gicp>=1.0', 'trimesh', 'pypcd4', 'laspy'],
         'dask': ['distributed'],
         'mavlink': ['pymavlink', 'pyserial'],
+        'fit': ['torch', 'onnx'],
         'test': ['pytest', 'hypothesis', 'mcap-ros2-support', 'pymavlink', 'pyserial',
                  'small-gicp>=1.0', 'trimesh', 'pypcd4', 'laspy', 'evo', 'distributed'],
         'dev': ['ruff', 'mypy', 'types-PyYAML', 'pytest-cov'],

@@ -16,6 +16,7 @@ from sphstereo_ros.core.reliability import (
     look,
     looks_at,
     network,
+    percentiles,
 )
 
 GRID = stereo_grid(64)
@@ -42,6 +43,12 @@ def everywhere() -> tuple[np.ndarray, np.ndarray]:
     return rows.ravel(), columns.ravel()
 
 
+def errors_of(parts, baselines=BASELINES) -> tuple[np.ndarray, np.ndarray]:
+    """The likely error of every pixel, and its unit."""
+    told, unit = percentiles(look(*parts), GRID, baselines, network())
+    return expected_error(told, unit, parts[1], baselines), unit
+
+
 def outputs(looks: np.ndarray, net: Network) -> np.ndarray:
     x = looks.astype(np.float64)
     for n, (weight, bias) in enumerate(zip(net.weights, net.biases, strict=True)):
@@ -60,7 +67,7 @@ def test_the_compiled_network_is_the_network():
     parts = found(np.random.default_rng(1))
     seen = look(*parts)
     looks, unit = looks_at(seen, GRID, BASELINES, *everywhere())
-    error, units = expected_error(seen, GRID, BASELINES, network())
+    error, units = errors_of(parts)
     np.testing.assert_array_equal(unit, units.ravel())
     out = outputs(looks, network())
     likely = unit * np.exp(np.maximum(out[:, 0], out[:, 1] - 1.3))
@@ -77,9 +84,9 @@ def test_the_compiled_network_is_the_network():
 @given(st.floats(0.01, 100), st.integers(0, 100))
 def test_only_what_is_relative_counts(scale, seed):
     """A world ten times as large, seen over baselines ten times as long, looks the same."""
-    small, large = (look(*found(np.random.default_rng(seed), s)) for s in (1.0, scale))
-    a, unit_a = expected_error(small, GRID, BASELINES, network())
-    b, unit_b = expected_error(large, GRID, [scale * x for x in BASELINES], network())
+    (a, unit_a), (b, unit_b) = (
+        errors_of(found(np.random.default_rng(seed), s), [s * x for x in BASELINES])
+        for s in (1.0, scale))
     np.testing.assert_allclose(unit_b * scale, unit_a, rtol=1e-4)
     np.testing.assert_allclose(b * scale, a, rtol=0.02)
 
@@ -87,8 +94,7 @@ def test_only_what_is_relative_counts(scale, seed):
 def test_grey_that_tells_nothing_is_never_sure():
     view, refined, other, matched, parallax = found(np.random.default_rng(2))
     blank = Refined(refined.rho, np.zeros_like(refined.information), refined.misfit)
-    error, unit = expected_error(look(view, blank, other, matched, parallax), GRID, BASELINES,
-                                 network())
+    error, unit = errors_of((view, blank, other, matched, parallax))
     assert (error > 1e3 * unit).all()
 
 
@@ -96,8 +102,8 @@ def test_where_opinions_differ_the_error_is_larger():
     view, _, _, _, parallax = found(np.random.default_rng(3))
     rho = np.full(GRID.shape, 0.2, np.float32)
     smooth = Refined(rho, np.full_like(rho, 1e6), np.full_like(rho, 5))
-    errors = [expected_error(look(view, smooth, rho * share, rho, parallax), GRID, BASELINES,
-                             network())[0][GRID.wrap:-GRID.wrap, 20:-20]
+    errors = [errors_of((view, smooth, rho * share, rho, parallax))[0][GRID.wrap:-GRID.wrap,
+                                                                       20:-20]
               for share in (np.float32(1), np.float32(1.5), np.float32(0.3))]
     assert np.median(errors[1]) > 2 * np.median(errors[0])
     assert np.median(errors[2]) > 2 * np.median(errors[0])

@@ -39,8 +39,8 @@ _WINDOWS = ((11, (1, 4, 10)), (10, (1, 4, 10)), (11, (1,)), (8, (1, 4)), (5, (1,
             (3, (1,)), (11, (2, 8)))
 _PIXELS = 60000  # of a window, even over the sphere
 _ROTATION, _DIRECTION = np.radians(0.003), np.radians(0.02)  # how far poses are off, as a rule
-_PERCENTILES = (0.683, 0.954, 0.98)  # of the error twice, and of what it is too far
-_LEAST, _MOST = 0.003, 5.0  # of the unit: what an error counts for at least and at most
+PERCENTILES = (0.683, 0.954, 0.98)  # of the error twice, and of what it is too far
+LEAST, MOST = 0.003, 5.0  # of the unit: what an error counts for at least and at most
 _RARE = 2.0  # weight of what is 10 to 100 m away
 _STEPS, _BATCH, _RATE = 12000, 4096, 3e-3
 
@@ -54,7 +54,7 @@ class Samples:
     weight: Floats
 
 
-class _Watched(JointMatcher):
+class Watched(JointMatcher):
     """Keeps what there is to see of pixels, and their measured and true inverse range."""
 
     def __init__(self, truth: TruthFrame, rng: np.random.Generator) -> None:
@@ -66,7 +66,7 @@ class _Watched(JointMatcher):
                 pairs: Sequence[tuple[Image8, RelativePose]]) -> Judged:
         seen = look(found.view, found.refined, found.other, found.matched, found.parallax)
         rows, columns = self._pixels(grid)
-        true = self._true(grid, axes, rows, columns)
+        true = self.true(grid, axes, rows, columns)
         looks, unit = looks_at(seen, grid, [p.baseline for _, p in pairs], rows, columns)
         rho = found.refined.rho[rows, columns]
         error, weight = (true - rho) / unit, np.ones_like(unit)
@@ -83,7 +83,7 @@ class _Watched(JointMatcher):
         row = self._rng.integers(0, 2 * grid.height, _PIXELS)
         return row + grid.wrap, column + grid.margin
 
-    def _true(self, grid: PolarGrid, axes: NDArray[np.float64], rows: NDArray[np.int64],
+    def true(self, grid: PolarGrid, axes: NDArray[np.float64], rows: NDArray[np.int64],
               columns: NDArray[np.int64]) -> Floats:
         """Inverse range, 1/m; NaN where it is unknown or moves."""
         theta, azimuth = grid.theta()[columns], grid.azimuth()[rows]
@@ -99,7 +99,8 @@ class _Watched(JointMatcher):
         return np.asarray(true[v, u])
 
 
-def _disturbed(pose: RelativePose, rng: np.random.Generator) -> RelativePose:
+def disturbed(pose: RelativePose, rng: np.random.Generator) -> RelativePose:
+    """The pose, as far off as an estimate is."""
     return RelativePose(exp(rng.normal(0, _ROTATION, 3)) @ pose.rotation,
                         exp(rng.normal(0, _DIRECTION, 3)) @ pose.position)
 
@@ -113,9 +114,9 @@ def samples_of(folder: Path, rng: np.random.Generator) -> list[Samples]:
             continue
         truth = sequence[current]
         references = [(sequence[current - k], k) for k in intervals]
-        watched = _Watched(truth, rng)
+        watched = Watched(truth, rng)
         watched.measure(as_frame(truth, 0), [
-            Reference(as_frame(frame, 0), _disturbed(true_pose(frame, truth), rng))
+            Reference(as_frame(frame, 0), disturbed(true_pose(frame, truth), rng))
             for frame, _ in references])
         assert watched.samples is not None
         found.append(watched.samples)
@@ -127,7 +128,7 @@ class Fit:
 
     def __init__(self, looks: Floats, rng: np.random.Generator, steps: int = _STEPS) -> None:
         self._steps = steps
-        sizes = (LOOKS, *HIDDEN, len(_PERCENTILES))
+        sizes = (LOOKS, *HIDDEN, len(PERCENTILES))
         self.weights = [rng.normal(0, np.sqrt(2 / a), (a, b)).astype(np.float32)
                         for a, b in pairwise(sizes)]
         self.biases = [np.zeros(b, np.float32) for b in sizes[1:]]
@@ -150,7 +151,7 @@ class Fit:
     def step(self, looks: Floats, wanted: Floats, weight: Floats, number: int) -> None:
         """One step down the gradient of the percentiles' loss."""
         layers = self.layers(looks)
-        percentiles = np.array(_PERCENTILES, np.float32)
+        percentiles = np.array(PERCENTILES, np.float32)
         slope = np.where(wanted > layers[-1], -percentiles, 1 - percentiles)
         slope = (slope * weight[:, None] / np.float32(len(looks))).astype(np.float32)
         by_weight, by_bias = [], []
@@ -190,7 +191,7 @@ def fit(samples: Sequence[Samples], rng: np.random.Generator, steps: int = _STEP
     error = np.concatenate([s.error for s in samples])
     weight = np.concatenate([s.weight for s in samples])
     sizes = np.stack([np.abs(error), np.abs(error), np.maximum(error, 0)], 1)
-    wanted = np.log(_LEAST + np.minimum(sizes, _MOST)).astype(np.float32)
+    wanted = np.log(LEAST + np.minimum(sizes, MOST)).astype(np.float32)
     found = Fit(looks, rng, steps)
     for number in tqdm(range(steps), unit='step'):
         chosen = rng.integers(0, len(looks), _BATCH)

@@ -5,11 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .frames import Image8
 from .matching import Parallax
 from .refinement import Refined
-from .reliability import expected_error, look, network
+from .reliability import expected_error, look, network, percentiles
+from .surroundings import inputs, judged
 from .sweep import reduction
 from .warp import Map, PolarGrid
 
@@ -17,6 +19,7 @@ MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
 # Of the unit: a likely error with which something counts as measured; one reference alone is sure
 # of little, so more is left to the frames that follow.
 _SURE, _SURE_ALONE = 0.8, 1.2
+_SURE_BOTH, _BOTH = 0.6, 0.85  # two opinions of the error: a limit, too; together they err less
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
 _AGREES, _LEVELS, _SLACK = 0.05, 0.75, 1.5
@@ -53,12 +56,30 @@ class Judged:
 
 
 def by_looks(found: Found, grid: PolarGrid, baselines: Sequence[float]) -> Judged:
-    """What looks as here errs so much as a rule; baselines of the references in m."""
+    """What looks as here errs so much as a rule; baselines of the references in m.
+
+    One reference alone is judged pixel by pixel: what is round about was not fitted to it.
+    """
     seen = look(found.view, found.refined, found.other, found.matched, found.parallax)
-    error, unit = expected_error(seen, grid, baselines, network())
+    own, unit = percentiles(seen, grid, baselines, network())
+    error = expected_error(own, unit, found.refined, baselines)
     limit = np.float32(_SURE if len(baselines) > 1 else _SURE_ALONE)
     sure = (error < limit * unit) & (found.refined.misfit < MISFIT)
+    if len(baselines) > 1:
+        wider = judged(inputs(found.view, seen, own, unit, grid, baselines), grid.shape)
+        error = expected_error(together(own, wider), unit, found.refined, baselines)
+        sure &= error < np.float32(_SURE_BOTH) * unit
+        error *= np.float32(_BOTH)
     return Judged(found.other, error, sure.astype(np.uint8))
+
+
+def together(own: NDArray[np.float32], wider: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What a pixel tells by itself and what is round about tell of its error, as one.
+
+    What is round about may refuse what the pixel believes; what it believes by itself counts half.
+    """
+    half = np.float32(0.5)
+    return np.asarray(np.maximum(wider, half * (own + wider)), np.float32)
 
 
 def by_agreement(found: Found, other: Map, grid: PolarGrid, baseline: float,

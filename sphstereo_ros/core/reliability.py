@@ -31,7 +31,7 @@ _TEXTURE = 9
 LEAK = 0.1
 _AT_ONCE = 64  # pixels that the network judges
 _LOGARITHMS = (0, 2, 4, 6, 8, 10, 12, 14, 16, 19, 21, 23, 24, 25, 26, 27, 29)  # of the inputs
-_TAIL = 1.3  # logarithm of how many standard deviations the 95th percentile may be away
+TAIL = 1.3  # logarithm of how many standard deviations the 95th percentile may be away
 # What may be much nearer is not known well, however likely the measurement is: the 98th percentile
 # counts with a share, where it means nearer than so many shortest baselines.
 _SHORT, _NEAR_BY = 0.67, 40.0
@@ -196,9 +196,9 @@ def _layer(x: Map, weight: Map, bias: Map, bend: bool,
 
 
 @fast_kernel
-def _error_rows(first: int, last: int, full: NDArray[np.float32], half: NDArray[np.float32],
-                sine: Map, scale: Map, w0: Map, b0: Map, w1: Map, b1: Map, w2: Map, b2: Map,
-                out: Map, units: Map) -> None:  # pragma: no cover - compiled
+def _percentile_rows(first: int, last: int, full: NDArray[np.float32], half: NDArray[np.float32],
+                     sine: Map, scale: Map, w0: Map, b0: Map, w1: Map, b1: Map, w2: Map, b2: Map,
+                     out: NDArray[np.float32], units: Map) -> None:  # pragma: no cover - compiled
     pixels = min(_AT_ONCE, sine.size)
     x, unit = np.empty((LOOKS, pixels), np.float32), np.empty(pixels, np.float32)
     y = np.empty((b0.size, pixels), np.float32)
@@ -213,15 +213,26 @@ def _error_rows(first: int, last: int, full: NDArray[np.float32], half: NDArray[
             _layer(x, w0, b0, True, y)
             _layer(y, w1, b1, True, z)
             _layer(z, w2, b2, False, end)
+            for k in range(end.shape[0]):
+                for p in range(pixels):
+                    out[k, i, start + p] = end[k, p]
             for p in range(pixels):
-                j = start + p
-                likely = unit[p] * np.exp(max(end[0, p], end[1, p] - np.float32(_TAIL)))
-                nearer = unit[p] * np.exp(end[2, p])
-                if (full[0, i, j] + nearer) * scale[1] * np.float32(_NEAR_BY) > np.float32(1):
-                    likely = max(likely, nearer * np.float32(_SHORT))
-                told = np.float32(_TOLD * _TOLD) / max(full[4, i, j], np.float32(1e-9))
-                out[i, j] = np.sqrt(likely * likely + told)
-                units[i, j] = unit[p]
+                units[i, start + p] = unit[p]
+
+
+@fast_kernel
+def _error_rows(first: int, last: int, told: NDArray[np.float32], rho: Map, information: Map,
+                units: Map, shortest: np.float32,
+                out: Map) -> None:  # pragma: no cover - compiled
+    for i in range(first, last):
+        for j in range(rho.shape[1]):
+            unit = units[i, j]
+            likely = unit * np.exp(max(told[0, i, j], told[1, i, j] - np.float32(TAIL)))
+            nearer = unit * np.exp(told[2, i, j])
+            if (rho[i, j] + nearer) * shortest * np.float32(_NEAR_BY) > np.float32(1):
+                likely = max(likely, nearer * np.float32(_SHORT))
+            noise = np.float32(_TOLD * _TOLD) / max(information[i, j], np.float32(1e-9))
+            out[i, j] = np.sqrt(likely * likely + noise)
 
 
 @fast_kernel
@@ -240,19 +251,36 @@ def _geometry(grid: PolarGrid, baselines: Sequence[float]) -> tuple[Map, Map]:
     return sine, np.array([grid.pixel, min(baselines), max(baselines)], np.float32)
 
 
-def expected_error(seen: Look, grid: PolarGrid, baselines: Sequence[float],
-                   fitted: Network) -> tuple[Map, Map]:
-    """Standard deviation of the inverse range that goes with such looks, and its unit: the
-    inverse range or, far away, a pixel of the longest baseline; 1/m, of grid.shape.
+def percentiles(seen: Look, grid: PolarGrid, baselines: Sequence[float],
+                fitted: Network) -> tuple[NDArray[np.float32], Map]:
+    """What the network tells of each pixel by itself.
 
-    seen : of `look`
+    Returns
+    -------
+    float32 (3, *grid.shape): its outputs, logarithms in units; and the unit: the inverse range or,
+    far away, a pixel of the longest baseline; 1/m, of grid.shape.
+
+    """
+    out = np.empty((fitted.biases[-1].size, *grid.shape), np.float32)
+    unit = np.empty(grid.shape, np.float32)
+    layers = [m for pair in zip(fitted.weights, fitted.biases, strict=True) for m in pair]
+    rows_in_parallel(_percentile_rows, len(unit), seen.full, seen.half,
+                     *_geometry(grid, baselines), *layers, out, unit)
+    return out, unit
+
+
+def expected_error(told: NDArray[np.float32], unit: Map, refined: Refined,
+                   baselines: Sequence[float]) -> Map:
+    """Standard deviation of the inverse range, 1/m, that goes with such percentiles.
+
+    told, unit : of `percentiles`
+    refined : the measurement
     baselines : of the references, m
     """
-    out, unit = np.empty(grid.shape, np.float32), np.empty(grid.shape, np.float32)
-    layers = [m for pair in zip(fitted.weights, fitted.biases, strict=True) for m in pair]
-    rows_in_parallel(_error_rows, len(out), seen.full, seen.half, *_geometry(grid, baselines),
-                     *layers, out, unit)
-    return out, unit
+    out = np.empty(unit.shape, np.float32)
+    rows_in_parallel(_error_rows, len(out), told, refined.rho, refined.information, unit,
+                     np.float32(min(baselines)), out)
+    return out
 
 
 def looks_at(seen: Look, grid: PolarGrid, baselines: Sequence[float], rows: NDArray[np.int64],

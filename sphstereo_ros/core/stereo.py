@@ -54,10 +54,13 @@ class SphericalStereo:
     def warm_up(self) -> None:
         """Compile what `process` needs."""
         noise = np.random.default_rng(0).integers(0, 255, (128, 256), np.uint8)
-        frames = [Frame(FrameKey(stamp, ''), noise) for stamp in range(3)]
+        frames = [Frame(FrameKey(stamp, ''), noise) for stamp in range(4)]
         pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -1.0]), 1e-9 * np.eye(6))
-        for reference, current in pairwise(frames):  # the second time, there is a memory
+        far = RelativePose(np.eye(3), 2 * pose.position, pose.covariance)
+        for reference, current in pairwise(frames[:3]):  # the second time, there is a memory
             self.process(AlignedWindow(current, (Reference(reference, pose),)))
+        self.process(AlignedWindow(frames[3], (Reference(frames[2], pose),
+                                               Reference(frames[1], far))))
         if self._pair is not None:
             top = Reference(Frame(FrameKey(0, 'top'), noise), pose)
             self.process(AlignedWindow(frames[1], (top, Reference(frames[0], pose))))

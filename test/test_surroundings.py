@@ -1,0 +1,119 @@
+"""How far a measurement errs, by what is round about."""
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_reliability import BASELINES, GRID, found
+
+from sphstereo_ros.core.judgement import together
+from sphstereo_ros.core.matching import UNKNOWN
+from sphstereo_ros.core.refinement import Refined
+from sphstereo_ros.core.reliability import look, network, percentiles
+from sphstereo_ros.core.surroundings import CHANNELS, inputs, judged
+
+ROUND = 16  # rows of half size beyond the seam
+
+
+def seen_at(parts, baselines=BASELINES):
+    view, refined, other, matched, parallax = parts
+    seen = look(view, refined, other, matched, parallax)
+    told, unit = percentiles(seen, GRID, baselines, network())
+    return inputs(view, seen, told, unit, GRID, baselines), seen, told, unit
+
+
+def mean(block) -> float:
+    return float(np.mean(np.asarray(block, np.float64)))
+
+
+@pytest.mark.parametrize(('h', 'w'), [(4, 0), (20, 11), (40, 39), (67, 25)])
+def test_the_inputs_of_a_pixel(h, w):
+    parts = found(np.random.default_rng(1))
+    view, refined, other, matched, _ = parts
+    out, seen, told, unit = seen_at(parts)
+    block = np.s_[2 * h:2 * h + 2, 2 * w:2 * w + 2]
+    theta = GRID.theta()[2 * w:2 * w + 2]
+    sine = np.maximum(np.abs(np.sin(theta)), 0.02)[None] * np.ones((2, 1))
+    rho, units, grey = refined.rho[block], unit[block], (view[block] / 64.0 - 2)
+    known = matched[block] != UNKNOWN
+    short, long = (units * b * sine / GRID.pixel for b in BASELINES)
+    exact = [*np.maximum(told[0], told[1] - 1.3)[block].ravel(), mean(told[2][block]),
+             *np.log(0.1 + short).ravel(), mean(np.clip(rho / units, -1, 1)), *grey.ravel(),
+             np.log(0.5 + seen.half[12, h, w]) - 1,
+             np.log(0.1 + mean(np.maximum(other[block] * sine / GRID.pixel * BASELINES[0], 0))),
+             mean(np.clip((rho - other[block]) / units, -2, 1.5)), mean(known),
+             mean(np.where(known, np.clip((rho - matched[block]) / units, -2, 1.5), 0)),
+             0.7 * (np.log(4 + mean(refined.misfit[block])) - 3),
+             0.2 * np.log(0.01 + mean(refined.information[block] * units**2)),
+             0.5 * np.log(0.1 + mean(long)), mean(sine), np.ptp(grey),
+             np.log(0.05 + seen.half[13, h, w]) + 1]
+    assert len(exact) == CHANNELS
+    np.testing.assert_allclose(out[0, :, ROUND + h, w], exact, rtol=1e-4, atol=1e-4)
+
+
+def test_beyond_the_seam_comes_what_lies_there():
+    out, seen, _, _ = seen_at(found(np.random.default_rng(2)))
+    rows, wrap = seen.half.shape[1], GRID.wrap // 2
+    inner = rows - 2 * wrap
+    x = out[0]
+    np.testing.assert_array_equal(x[:, :ROUND + wrap], x[:, inner:inner + ROUND + wrap])
+    assert not np.array_equal(x[:, :ROUND], x[:, ROUND:2 * ROUND])
+
+
+def test_sizes_halve_evenly():
+    out, seen, told, _ = seen_at(found(np.random.default_rng(3)))
+    assert out.shape[2] % 8 == out.shape[3] % 8 == 0
+    assert out.shape[2] >= seen.half.shape[1] + 2 * ROUND
+    assert judged(out, GRID.shape).shape == told.shape
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.floats(0.01, 100), st.integers(0, 100))
+def test_only_what_is_relative_counts(scale, seed):
+    """A world ten times as large, seen over baselines ten times as long, looks the same."""
+    small, large = (judged(seen_at(found(np.random.default_rng(seed), s),
+                                   [s * b for b in BASELINES])[0], GRID.shape)
+                    for s in (1.0, scale))
+    np.testing.assert_allclose(small, large, atol=0.05)
+
+
+def test_a_view_that_is_turned_is_judged_as_before():
+    """About the direction of motion; the network sees 16 px of half size beyond the seam."""
+    parts = found(np.random.default_rng(4))
+    turn, wrap = 16, GRID.wrap
+
+    def turned(image):
+        inner = np.roll(image[wrap:-wrap], turn, 0)
+        return np.ascontiguousarray(np.concatenate([inner[-wrap:], inner, inner[:wrap]]))
+
+    def closed(image, by=1):
+        border = wrap // by
+        inner = image[border:-border]
+        return np.ascontiguousarray(np.concatenate([inner[-border:], inner, inner[:border]]))
+
+    view, refined, other, matched, parallax = parts
+    refined = Refined(*(closed(m) for m in (refined.rho, refined.information, refined.misfit)))
+    first = (closed(view), refined, closed(other), closed(matched), parallax)
+    second = (turned(first[0]), Refined(*(turned(m) for m in (
+        refined.rho, refined.information, refined.misfit))), turned(first[2]), turned(first[3]),
+        parallax)
+    parallax.sigma[:] = 0.5
+    a, b = (judged(seen_at(p)[0], GRID.shape)[:, wrap:-wrap] for p in (first, second))
+    np.testing.assert_allclose(np.roll(a, turn, 1)[:, 64:-64], b[:, 64:-64], atol=0.3)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1000))
+def test_what_is_round_about_may_refuse_but_not_believe_alone(seed):
+    own, wider = np.random.default_rng(seed).normal(size=(2, 3, 4, 5)).astype(np.float32)
+    told = together(own, wider)
+    assert (told >= wider).all()
+    assert (told >= 0.5 * (own + wider) - 1e-6).all()
+    np.testing.assert_allclose(together(own, own), own, atol=1e-6)
+
+
+def test_noise_is_not_believed():
+    """Ranges without any rhyme: an error of a fifth at least is told of nearly all."""
+    out, _, told, _ = seen_at(found(np.random.default_rng(5)))
+    assert np.mean(together(told, judged(out, GRID.shape))[0] > np.log(0.2)) > 0.9

@@ -1,0 +1,44 @@
+"""The network of what is round about, while it is fitted: runs where torch and onnx are."""
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from sphstereo_ros.bench.surroundings import LAYERS, Patch, as_onnx, begun, fit, forward
+from sphstereo_ros.core.surroundings import CHANNELS
+
+torch = pytest.importorskip('torch')
+pytest.importorskip('onnx')
+
+
+def weights(parts) -> dict[str, np.ndarray]:
+    return {name: part.detach().numpy() for name, part in parts.items()}
+
+
+@pytest.mark.parametrize('shape', [(64, 64), (96, 40)])
+def test_opencv_runs_what_was_fitted(shape):
+    parts = begun(torch.Generator().manual_seed(1))
+    net = cv2.dnn.readNetFromONNX(np.frombuffer(as_onnx(weights(parts)), np.uint8))
+    x = np.random.default_rng(0).normal(size=(1, CHANNELS, *shape)).astype(np.float32)
+    net.setInput(x)
+    with torch.no_grad():
+        expected = forward(parts, torch.from_numpy(x)).numpy()
+    assert expected.shape == (1, LAYERS['tell'][1], *shape)
+    np.testing.assert_allclose(net.forward(), expected, atol=1e-4)
+
+
+def test_a_fit_tells_small_errors_from_large_ones():
+    """Errors are Gaussian, ten times as large where one input is high."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(0, 0.1, (CHANNELS, 64, 64)).astype(np.float32)
+    x[22, :, 32:] += 1
+    sigma = np.where(np.arange(128) < 64, 0.02, 0.2)[None] * np.ones((128, 1))
+    error = (sigma * rng.normal(size=(128, 128))).astype(np.float32)
+    parts = fit([Patch(x.astype(np.float16), error, np.ones_like(error))], 0.2, rng)
+    with torch.no_grad():
+        out = forward(parts, torch.from_numpy(x)[None]).numpy()[0]
+    told = np.exp(out[:4].mean(0))
+    small, large = np.median(told[:, 4:28]), np.median(told[:, 36:60])
+    assert small == pytest.approx(0.02, rel=0.5)
+    assert large == pytest.approx(0.2, rel=0.5)
