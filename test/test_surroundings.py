@@ -1,17 +1,27 @@
 """How far a measurement errs, by what is round about."""
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_reliability import BASELINES, GRID, found
 
+from sphstereo_ros.bench.accuracy import as_frame
+from sphstereo_ros.bench.obstacles import frames_of_bag
+from sphstereo_ros.core import judgement
+from sphstereo_ros.core.config import resolve
+from sphstereo_ros.core.frames import Reference
+from sphstereo_ros.core.joint import JointMatcher
 from sphstereo_ros.core.judgement import together
-from sphstereo_ros.core.matching import UNKNOWN
+from sphstereo_ros.core.matching import UNKNOWN, matcher
 from sphstereo_ros.core.refinement import Refined
 from sphstereo_ros.core.reliability import look, network, percentiles
 from sphstereo_ros.core.surroundings import CHANNELS, inputs, judged
+from sphstereo_ros.scenes.sequence import true_pose
 
 ROUND = 16  # rows of half size beyond the seam
 
@@ -117,3 +127,26 @@ def test_noise_is_not_believed():
     """Ranges without any rhyme: an error of a fifth at least is told of nearly all."""
     out, _, told, _ = seen_at(found(np.random.default_rng(5)))
     assert np.mean(together(told, judged(out, GRID.shape))[0] > np.log(0.2)) > 0.9
+
+
+def test_sky_behind_leaves_is_refused(monkeypatch):
+    """On the sample bag: sky that would be measured nearer than 10 m."""
+    frames = list(frames_of_bag(Path(__file__).parents[1] / 'bags' / 'street.mcap'))[4:15]
+    current = frames[-1]
+    window = [Reference(as_frame(f, 480), true_pose(f, current))
+              for f in (frames[-2], frames[-5], frames[0])]
+    sky = cv2.resize(np.isposinf(current.range).view(np.uint8), (960, 480),
+                     interpolation=cv2.INTER_NEAREST) > 0
+    near = cv2.resize((current.range < 10).view(np.uint8), (960, 480),
+                      interpolation=cv2.INTER_NEAREST) > 0
+    matcher_ = JointMatcher('joint', matcher(resolve({}).stereo))
+
+    def believed() -> tuple[float, float]:
+        found = matcher_.measure(as_frame(current, 480), window)
+        sure = (found.agreed > 0) & (found.sigma < 0.3 * found.rho)
+        return (sure & (found.rho > 0.1))[sky].mean(), sure[near].mean()
+    ghosts, known = believed()
+    monkeypatch.setattr(judgement, 'together', lambda own, wider: own)
+    alone, before = believed()
+    assert ghosts < 0.25 * alone
+    assert known > before - 0.03
