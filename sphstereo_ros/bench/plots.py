@@ -80,7 +80,7 @@ def coverage_by_angle(summaries: Summaries) -> Figure:
         axes.set_xticks(places, [f'{low:g}–{high:g}' for low, high in steps])
         axes.set_xlabel('angle from the direction of motion, degrees')
         axes.grid(alpha=0.4)
-    coverage.legend()
+    coverage.legend(loc='lower right')
     return figure
 
 
