@@ -110,7 +110,8 @@ def test_the_map_of_a_drive_is_in_odom(ros: Graph) -> None:
     client = ros.client
     client.subscribe(PointCloud2, 'map')
     client.subscribe(Odometry, 'map/odometry')
-    ros.start(NODE, 'mapping.rate:=100.0', 'mapping.min_frames:=2')
+    # Every frame has its map, also where two are done within a hundredth of a second.
+    ros.start(NODE, 'mapping.rate:=1000.0', 'mapping.min_frames:=2')
     feed = Feed(ros, with_odometry=True)
     feed.odometry(0)
     feed.drive(1, COUNT)

@@ -318,7 +318,7 @@ class MappingConfig:
                               'ground, from which metres come where baseline.source tells none; '
                               '0 = unknown', unit='m', low=0.0, high=1000.0)
     rate: float = _p('mapping.rate', 0.5, 'how often the node publishes the map, at most',
-                     unit='Hz', low=0.001, high=100.0)
+                     unit='Hz', low=0.001, high=1000.0)
 
 
 @dataclass(frozen=True)
