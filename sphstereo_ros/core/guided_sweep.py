@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,30 +19,26 @@ from numpy.typing import NDArray
 
 from .frames import Image8, RelativePose
 from .jit import kernel, rows_in_parallel
-from .sphere import polar_axes
 from .sweep import (
     _BANDS,
     _CONTRAST,
     _CONTRAST_LIMIT,
     _FREE,
-    _MARGIN,
     MOST_LEVELS,
-    REACH,
     Census,
     Floats,
     Volume,
     _advance,
     _different_bits,
     _jump,
-    _place_rows,
-    _polar_table,
+    _seen,
     _shrunk,
     _view,
     _winner_rows,
     levels,
     reduction,
 )
-from .warp import Map, PolarGrid, polar_map, resample, with_border
+from .warp import Map, PolarGrid
 
 Levels = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
@@ -66,28 +63,14 @@ class Swept:
     step: Map
 
 
-@dataclass(frozen=True)
-class _Seen:
-    """References on polar grids of their own: one after the other, (references, rows, columns).
-
-    row, column : where each pixel of the current grid is seen if it is far away
-    table : (references, columns, levels) column that a column moves to at a level
-    used : (references,) number of levels at which a reference takes part
-    """
-
-    census: Census
-    contrast: Bytes
-    row: Map
-    column: Map
-    table: Map
-    used: NDArray[np.int64]
-
-
 @kernel
 def _cost_rows(first: int, last: int, census: Census, contrast: Bytes, seen_census: Census,
                seen_contrast: Bytes, row: Map, column: Map, table: Map, used: NDArray[np.int64],
                known: Map, cost: Bytes) -> None:  # pragma: no cover - compiled
-    """Mean of the two least costs of a level, (rows, columns, levels), and what holds it."""
+    """Mean of the two least costs of a level, (rows, columns, levels), and what holds it.
+
+    seen_census … used : of all references, as in `sweep._Seen`, one after the other
+    """
     count, rows, columns = seen_census.shape
     half = np.float32(0.5)
     least, second, found = (np.empty(cost.shape[2], np.uint16), np.empty(cost.shape[2], np.uint16),
@@ -200,27 +183,13 @@ def _fine_levels(baselines: Sequence[float], pixel: float) -> Floats:
     return found
 
 
-def _seen(references: Sequence[tuple[Image8, RelativePose]], half: PolarGrid, axes: Floats,
-          by: int, level: Floats) -> _Seen:
-    own_grid = PolarGrid(half.height, _MARGIN, _MARGIN)
-    count, theta, azimuth = len(references), half.theta(), half.azimuth()
-    census = np.empty((count, *own_grid.shape), np.uint32)
-    contrast = np.empty((count, *own_grid.shape), np.uint8)
-    row, column = (np.empty((count, *half.shape), np.float32) for _ in range(2))
-    for n, (image, pose) in enumerate(references):
-        small, own_axes = _shrunk(image, by), polar_axes(pose.direction)
-        view = _view(np.asarray(resample(with_border(small), polar_map(
-            own_grid, pose.rotation.T @ own_axes, small.shape)), np.uint8))
-        census[n], contrast[n] = view.census, view.contrast
-        parts = [np.ascontiguousarray(a, np.float32) for a in (
-            np.cos(theta), np.sin(theta), np.cos(azimuth), np.sin(azimuth), own_axes.T @ axes)]
-        rows_in_parallel(_place_rows, half.shape[0], *parts, np.float32(1 / half.pixel),
-                         np.float32(own_grid.margin - 0.5), row[n], column[n])
+def _all_seen(references: Sequence[tuple[Image8, RelativePose]], half: PolarGrid, axes: Floats,
+              by: int, level: Floats) -> list[NDArray[Any]]:
+    """What `sweep._Seen` has of each reference, stacked: (references, …)."""
     nearest = references[0][1].baseline
-    used = np.array([level.size if p.baseline == nearest
-                     else np.searchsorted(level, REACH / p.baseline) for _, p in references])
-    table = np.stack([_polar_table(own_grid, level, p.baseline) for _, p in references])
-    return _Seen(census, contrast, row, column, table, used)
+    seen = [_seen(_shrunk(image, by), pose, half, axes, level, pose.baseline == nearest)
+            for image, pose in references]
+    return [np.stack(parts) for parts in zip(*seen, strict=True)]
 
 
 def guided_sweep(current: Image8, grid: PolarGrid, axes: Floats,
@@ -237,12 +206,11 @@ def guided_sweep(current: Image8, grid: PolarGrid, axes: Floats,
     half = PolarGrid(grid.height // by, grid.margin // by, grid.wrap // by)
     view = _view(_shrunk(current, by))
     level = _fine_levels([p.baseline for _, p in references], half.pixel)
-    seen = _seen(references, half, axes, by, level)
+    seen = _all_seen(references, half, axes, by, level)
     small = cv2.resize(known, half.shape[::-1], interpolation=cv2.INTER_AREA)
     number = np.arange(level.size)
     cost = np.empty((*half.shape, level.size), np.uint8)
-    rows_in_parallel(_cost_rows, len(cost), view.census, view.contrast, seen.census,
-                     seen.contrast, seen.row, seen.column, seen.table, seen.used,
+    rows_in_parallel(_cost_rows, len(cost), view.census, view.contrast, *seen,
                      np.interp(small, level, number).astype(np.float32), cost)
     smooth = np.interp(cv2.medianBlur(small, 5), level, number).astype(np.float32)
     plane, total = planes(smooth), np.zeros(cost.shape, np.uint16)

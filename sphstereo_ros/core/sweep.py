@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -47,6 +48,23 @@ class _View:
     image: Image8
     census: Census
     contrast: Image8
+
+
+class _Seen(NamedTuple):
+    """A reference on a polar grid of its own, about its own direction of motion.
+
+    census, contrast : of that grid's pixels
+    row, column : where on it each pixel of the current grid is seen if it is far away
+    table : (columns, levels) column that a column moves to at a level
+    used : number of levels at which the reference takes part
+    """
+
+    census: Census
+    contrast: Image8
+    row: Map
+    column: Map
+    table: Map
+    used: int
 
 
 def levels(baselines: Sequence[float], pixel: float, step: float = _LEVEL) -> Floats:
@@ -260,6 +278,34 @@ def _polar_table(grid: PolarGrid, level: Floats, baseline: float) -> Map:
     return np.ascontiguousarray(moved / grid.pixel + grid.margin - 0.5, np.float32)
 
 
+def _placed(grid: PolarGrid, own_grid: PolarGrid, turn: Floats) -> tuple[Map, Map]:
+    """Row and column on a reference's own grid of every pixel of the current one, if far.
+
+    turn : (3, 3) from the current grid's axes to the reference's
+    """
+    row, column = np.empty(grid.shape, np.float32), np.empty(grid.shape, np.float32)
+    theta, azimuth = grid.theta(), grid.azimuth()
+    parts = [np.ascontiguousarray(a, np.float32) for a in (
+        np.cos(theta), np.sin(theta), np.cos(azimuth), np.sin(azimuth), turn)]
+    rows_in_parallel(_place_rows, len(row), *parts, np.float32(1 / own_grid.pixel),
+                     np.float32(own_grid.margin - 0.5), row, column)
+    return row, column
+
+
+def _seen(image: Image8, pose: RelativePose, grid: PolarGrid, axes: Floats, level: Floats,
+          nearest: bool) -> _Seen:
+    """What a reference (its image shrunk like `grid`, the current one) adds to a sweep.
+
+    nearest : it takes part at every level
+    """
+    own_grid, own_axes = PolarGrid(grid.height, _MARGIN, _MARGIN), polar_axes(pose.direction)
+    view = _view(np.asarray(resample(with_border(image), polar_map(
+        own_grid, pose.rotation.T @ own_axes, image.shape)), np.uint8))
+    used = level.size if nearest else int(np.searchsorted(level, REACH / pose.baseline))
+    return _Seen(view.census, view.contrast, *_placed(grid, own_grid, own_axes.T @ axes),
+                 _polar_table(own_grid, level, pose.baseline), used)
+
+
 def sweep(current: Image8, grid: PolarGrid, axes: Floats,
           references: Sequence[tuple[Image8, RelativePose]]) -> tuple[Map, float]:
     """Inverse range on the current view's polar grid, shrunk by `reduction` (to half as a rule).
@@ -284,8 +330,8 @@ def sweep(current: Image8, grid: PolarGrid, axes: Floats,
     level = levels(baselines, half.pixel)
     total = np.zeros((*view.image.shape, level.size), np.uint16)
     for image, pose in references:
-        small = _shrunk(image, by)
-        _add_reference(view, half, axes, small, pose, level, pose is references[0][1], total)
+        seen = _seen(_shrunk(image, by), pose, half, axes, level, pose is references[0][1])
+        rows_in_parallel(_cost_rows, len(total), view.census, view.contrast, *seen, total)
     cost = np.empty(total.shape, np.uint8)
     rows_in_parallel(_scale_rows, len(total), total, 2.0 / len(references), cost)
     rows_in_parallel(_along_rows, len(total), cost, view.image, total)
@@ -295,21 +341,3 @@ def sweep(current: Image8, grid: PolarGrid, axes: Floats,
     out = np.empty(view.image.shape, np.float32)
     rows_in_parallel(_winner_rows, len(total), total, level.astype(np.float32), out)
     return cv2.medianBlur(out, 3), float(level[1] - level[0])
-
-
-def _add_reference(view: _View, half: PolarGrid, axes: Floats, small: Image8, pose: RelativePose,
-                   level: Floats, nearest: bool, total: Volume) -> None:
-    own_grid = PolarGrid(half.height, _MARGIN, _MARGIN)
-    own_axes = polar_axes(pose.direction)
-    reference = _view(np.asarray(resample(with_border(small), polar_map(
-        own_grid, pose.rotation.T @ own_axes, small.shape)), np.uint8))
-    row, column = np.empty(total.shape[:2], np.float32), np.empty(total.shape[:2], np.float32)
-    theta, azimuth = half.theta(), half.azimuth()
-    parts = [np.ascontiguousarray(a, np.float32) for a in (
-        np.cos(theta), np.sin(theta), np.cos(azimuth), np.sin(azimuth), own_axes.T @ axes)]
-    rows_in_parallel(_place_rows, len(row), *parts, np.float32(1 / half.pixel),
-                     np.float32(own_grid.margin - 0.5), row, column)
-    used = level.size if nearest else int(np.searchsorted(level, REACH / pose.baseline))
-    rows_in_parallel(_cost_rows, len(total), view.census, view.contrast, reference.census,
-                     reference.contrast, row, column,
-                     _polar_table(own_grid, level, pose.baseline), used, total)
