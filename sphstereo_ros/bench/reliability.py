@@ -24,7 +24,7 @@ from sphstereo_ros.core.frames import Image8, Reference, RelativePose
 from sphstereo_ros.core.joint import JointMatcher
 from sphstereo_ros.core.judgement import Found, Judged
 from sphstereo_ros.core.matching import matcher
-from sphstereo_ros.core.reliability import LEAK, LOOKS, look, looks_at
+from sphstereo_ros.core.reliability import LEAK, LOOKS, Look, look, looks_at
 from sphstereo_ros.core.rotations import exp
 from sphstereo_ros.core.warp import PolarGrid
 from sphstereo_ros.scenes.sequence import TruthFrame, load_sequence, true_pose
@@ -55,36 +55,26 @@ class Samples:
 
 
 class Watched(JointMatcher):
-    """Keeps what there is to see of pixels, and their measured and true inverse range."""
+    """Shows what it found of a window to `watch`, in place of a judgement."""
 
-    def __init__(self, truth: TruthFrame, rng: np.random.Generator) -> None:
+    def __init__(self, truth: TruthFrame) -> None:
         super().__init__('joint', matcher(resolve({}).stereo))
-        self._truth, self._rng = truth, rng
-        self.samples: Samples | None = None
+        self._truth = truth
+
+    def watch(self, found: Found, seen: Look, grid: PolarGrid, axes: NDArray[np.float64],
+              baselines: Sequence[float]) -> None:
+        """Keep what is needed of it."""
+        raise NotImplementedError
 
     def _judged(self, found: Found, grid: PolarGrid, axes: NDArray[np.float64],
                 pairs: Sequence[tuple[Image8, RelativePose]]) -> Judged:
         seen = look(found.view, found.refined, found.other, found.matched, found.parallax)
-        rows, columns = self._pixels(grid)
-        true = self.true(grid, axes, rows, columns)
-        looks, unit = looks_at(seen, grid, [p.baseline for _, p in pairs], rows, columns)
-        rho = found.refined.rho[rows, columns]
-        error, weight = (true - rho) / unit, np.ones_like(unit)
-        weight[(true > 0.01) & (true < 0.1)] = _RARE
-        known = np.isfinite(true)
-        self.samples = Samples(looks[known], error[known], weight[known])
+        self.watch(found, seen, grid, axes, [p.baseline for _, p in pairs])
         nothing = np.zeros_like(found.refined.rho)
         return Judged(found.other, nothing, nothing.astype(np.uint8))
 
-    def _pixels(self, grid: PolarGrid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Even over the sphere, not in the margins."""
-        theta = np.arccos(self._rng.uniform(-1, 1, _PIXELS))
-        column = np.clip((theta / grid.pixel).astype(np.int64), 0, grid.height - 1)
-        row = self._rng.integers(0, 2 * grid.height, _PIXELS)
-        return row + grid.wrap, column + grid.margin
-
     def true(self, grid: PolarGrid, axes: NDArray[np.float64], rows: NDArray[np.int64],
-              columns: NDArray[np.int64]) -> Floats:
+             columns: NDArray[np.int64]) -> Floats:
         """Inverse range, 1/m; NaN where it is unknown or moves."""
         theta, azimuth = grid.theta()[columns], grid.azimuth()[rows]
         sine = np.sin(theta)
@@ -97,6 +87,33 @@ class Watched(JointMatcher):
         if self._truth.moving is not None:
             true[self._truth.moving] = np.nan
         return np.asarray(true[v, u])
+
+
+class _Sampled(Watched):
+    """Keeps what there is to see of pixels, and how far their measurement errs."""
+
+    def __init__(self, truth: TruthFrame, rng: np.random.Generator) -> None:
+        super().__init__(truth)
+        self._rng = rng
+        self.samples: Samples | None = None
+
+    def watch(self, found: Found, seen: Look, grid: PolarGrid, axes: NDArray[np.float64],
+              baselines: Sequence[float]) -> None:
+        rows, columns = self._pixels(grid)
+        true = self.true(grid, axes, rows, columns)
+        looks, unit = looks_at(seen, grid, baselines, rows, columns)
+        rho = found.refined.rho[rows, columns]
+        error, weight = (true - rho) / unit, np.ones_like(unit)
+        weight[(true > 0.01) & (true < 0.1)] = _RARE
+        known = np.isfinite(true)
+        self.samples = Samples(looks[known], error[known], weight[known])
+
+    def _pixels(self, grid: PolarGrid) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Even over the sphere, not in the margins."""
+        theta = np.arccos(self._rng.uniform(-1, 1, _PIXELS))
+        column = np.clip((theta / grid.pixel).astype(np.int64), 0, grid.height - 1)
+        row = self._rng.integers(0, 2 * grid.height, _PIXELS)
+        return row + grid.wrap, column + grid.margin
 
 
 def disturbed(pose: RelativePose, rng: np.random.Generator) -> RelativePose:
@@ -114,12 +131,12 @@ def samples_of(folder: Path, rng: np.random.Generator) -> list[Samples]:
             continue
         truth = sequence[current]
         references = [(sequence[current - k], k) for k in intervals]
-        watched = Watched(truth, rng)
-        watched.measure(as_frame(truth, 0), [
+        sampled = _Sampled(truth, rng)
+        sampled.measure(as_frame(truth, 0), [
             Reference(as_frame(frame, 0), disturbed(true_pose(frame, truth), rng))
             for frame, _ in references])
-        assert watched.samples is not None
-        found.append(watched.samples)
+        assert sampled.samples is not None
+        found.append(sampled.samples)
     return found
 
 

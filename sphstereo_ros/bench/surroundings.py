@@ -10,18 +10,18 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from sphstereo_ros.core.frames import Image8, Reference
-from sphstereo_ros.core.judgement import Found, Judged
-from sphstereo_ros.core.reliability import look, network, percentiles
+from sphstereo_ros.core.frames import Reference
+from sphstereo_ros.core.judgement import Found
+from sphstereo_ros.core.reliability import Look, network, percentiles
 from sphstereo_ros.core.surroundings import CHANNELS, inputs, interior
 from sphstereo_ros.core.warp import PolarGrid
 from sphstereo_ros.scenes.sequence import (
@@ -37,6 +37,7 @@ from .reliability import LEAST, MOST, PERCENTILES, Watched, disturbed
 
 Floats = NDArray[np.floating]
 Parameters = dict[str, Any]  # name of a layer → weight and bias
+Node = TypeVar('Node')
 
 _SEEDS = range(11, 41)
 _RENDERED = (1, 7, 10, 11)  # frames of a sequence
@@ -78,11 +79,9 @@ class _Kept(Watched):
 
     patch: Patch | None = None
 
-    def _judged(self, found: Found, grid: PolarGrid, axes: NDArray[np.float64],
-                pairs: Sequence[tuple[Image8, Any]]) -> Judged:
-        baselines = [p.baseline for _, p in pairs]
+    def watch(self, found: Found, seen: Look, grid: PolarGrid, axes: NDArray[np.float64],
+              baselines: Sequence[float]) -> None:
         rho = found.refined.rho
-        seen = look(found.view, found.refined, found.other, found.matched, found.parallax)
         told, unit = percentiles(seen, grid, baselines, network())
         x = interior(inputs(found.view, seen, told, unit, grid, baselines), grid.shape)
         true = self.true(grid, axes, *(n.ravel() for n in np.indices(grid.shape)))
@@ -93,8 +92,6 @@ class _Kept(Watched):
         weight *= np.where((true > 0.1) & (rho < true / 1.5), _TOO_FAR, 1)
         self.patch = Patch(x[0].astype(np.float16), np.nan_to_num(error).astype(np.float32),
                            weight.astype(np.float32))
-        nothing = np.zeros_like(rho)
-        return Judged(found.other, nothing, nothing.astype(np.uint8))
 
 
 def patches_of(folder: Path, rng: np.random.Generator) -> list[Patch]:
@@ -103,7 +100,7 @@ def patches_of(folder: Path, rng: np.random.Generator) -> list[Patch]:
     found = []
     for current, references in _WINDOWS.get(len(sequence), ()):
         truth = sequence[current]
-        kept = _Kept(truth, rng)
+        kept = _Kept(truth)
         kept.measure(as_frame(truth, 0), [
             Reference(as_frame(sequence[k], 0), disturbed(true_pose(sequence[k], truth), rng))
             for k in references])
@@ -145,6 +142,23 @@ def begun(generator: Any) -> Parameters:
     return made
 
 
+def walk(x: Node, layer: Callable[[str, Node], Node], bent: Callable[[Node], Node],
+         joined: Callable[[Node, Node], Node]) -> Node:
+    """Walk the network's graph from x to what comes out, each step done by the caller's means.
+
+    layer : by its name in LAYERS; bent : the activation; joined : (coarse, fine) → fine plus
+    coarse at twice the size
+    """
+    levels = [bent(layer('enter', x))]
+    for n in (1, 2, 3):
+        levels.append(bent(layer(f'stay{n}', bent(layer(f'down{n}', levels[-1])))))
+    y = levels[3]
+    for n in (2, 1):
+        y = bent(layer(f'join{n}', joined(layer(f'up{n}', y), levels[n])))
+    y = bent(joined(layer('up0', y), levels[0]))
+    return layer('tell', bent(layer('join0', y)))
+
+
 def forward(parts: Parameters, x: Any) -> Any:
     """Outputs (N, 4 · percentiles, rows, columns) of x (N, CHANNELS, rows, columns)."""
     from torch.nn import functional
@@ -157,15 +171,9 @@ def forward(parts: Parameters, x: Any) -> Any:
     def bent(x: Any) -> Any:
         return functional.leaky_relu(x, _LEAK)
 
-    def joined(x: Any, name: str, finer: Any) -> Any:
-        return finer + functional.interpolate(layer(name, x), scale_factor=2, mode='nearest')
-    levels = [bent(layer('enter', x))]
-    for n in (1, 2, 3):
-        levels.append(bent(layer(f'stay{n}', bent(layer(f'down{n}', levels[-1])))))
-    y = levels[3]
-    for n in (2, 1):
-        y = bent(layer(f'join{n}', joined(y, f'up{n}', levels[n])))
-    return layer('tell', bent(layer('join0', bent(joined(y, 'up0', levels[0])))))
+    def joined(coarse: Any, fine: Any) -> Any:
+        return fine + functional.interpolate(coarse, scale_factor=2, mode='nearest')
+    return walk(x, layer, bent, joined)
 
 
 def loss(out: Any, error: Any, weight: Any) -> Any:
@@ -249,18 +257,11 @@ def as_onnx(weights: dict[str, NDArray[np.float32]]) -> bytes:
     def bent(x: str) -> str:
         return node('LeakyRelu', [x], f'{x}.bent', alpha=_LEAK)
 
-    def joined(x: str, name: str, finer: str) -> str:
-        larger = node('Resize', [layer(name, x), 'all', 'twice'], f'{name}.larger',
-                      mode='nearest', coordinate_transformation_mode='asymmetric',
-                      nearest_mode='floor')
-        return node('Add', [finer, larger], f'{name}.sum')
-    levels = [bent(layer('enter', 'x'))]
-    for n in (1, 2, 3):
-        levels.append(bent(layer(f'stay{n}', bent(layer(f'down{n}', levels[-1])))))
-    y = levels[3]
-    for n in (2, 1):
-        y = bent(layer(f'join{n}', joined(y, f'up{n}', levels[n])))
-    out = layer('tell', bent(layer('join0', bent(joined(y, 'up0', levels[0])))))
+    def joined(coarse: str, fine: str) -> str:
+        larger = node('Resize', [coarse, 'all', 'twice'], f'{coarse}.larger', mode='nearest',
+                      coordinate_transformation_mode='asymmetric', nearest_mode='floor')
+        return node('Add', [fine, larger], f'{coarse}.sum')
+    out = walk('x', layer, bent, joined)
     kind = onnx.TensorProto.FLOAT
     graph = helper.make_graph(
         nodes, 'surroundings', [helper.make_tensor_value_info('x', kind, [1, CHANNELS, 64, 64])],
