@@ -2,12 +2,10 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sphstereo_ros.core.baseline import Track as SensorTrack
 from sphstereo_ros.core.baseline import interpolate_odometry
@@ -28,15 +26,14 @@ from sphstereo_ros.ros.conversions import (
     cloud_message,
     decode_frame,
     odometry_sample,
-    read_stamped_depth,
     read_window,
     track_message,
 )
 from sphstereo_ros.ros.live_messages import make
-from sphstereo_ros.ros.matching import Covariances, RangeMatcher
+from sphstereo_ros.ros.matching import Covariances
 from sphstereo_ros.ros.messages import SECOND, frame_key
 from sphstereo_ros.ros.shell import Shell, run
-from sphstereo_ros.ros.stage import COVARIANCE, covariance_topic
+from sphstereo_ros.ros.stage import COVARIANCE, RangeInput, covariance_topic
 
 WINDOWS = 'pairs/aligned'
 # Frames whose points wait for better poses, and what may wait for its other half.
@@ -44,8 +41,6 @@ LAG, QUEUE, KEPT = 12, 4, 60
 # Windows that were lost in a row before the map begins anew.
 LOST = 30
 _NO_PIXELS = np.zeros((2, 4), np.uint8)
-
-TakePart = Callable[[FrameKey, NDArray[np.float32], float], list[tuple[RangeImage | Drop, float]]]
 
 
 class MappingComponent:
@@ -57,7 +52,8 @@ class MappingComponent:
         self._worker = shell.worker('mapping', self._monitor, QUEUE)
         self._map = shell.output('sensor_msgs/msg/PointCloud2', 'map', qos.LARGE_RESULT)
         self._track = shell.output('nav_msgs/msg/Odometry', 'map/odometry')
-        self._matcher, self._covariances = RangeMatcher(), Covariances()
+        self._depth = RangeInput(shell, self._monitor, self._take_range)
+        self._covariances = Covariances()
         self._windows: OrderedDict[FrameKey, AlignedWindow] = OrderedDict()
         self._images: OrderedDict[FrameKey, tuple[RangeImage, float]] = OrderedDict()
         self._frames: OrderedDict[FrameKey, Any] = OrderedDict()
@@ -89,10 +85,7 @@ class MappingComponent:
         take(COVARIANCE, covariance_topic(WINDOWS), self._take_covariance, self._monitor,
              qos.PARTS)
         take('nav_msgs/msg/Path', WINDOWS, self._take_window, self._monitor, qos.PARTS)
-        for topic, add in (('depth/image', self._matcher.add_range),
-                           ('depth/sigma', self._matcher.add_sigma)):
-            take('sensor_msgs/msg/Image', topic, partial(self._take_part, add), self._monitor,
-                 qos.LARGE_RESULT)
+        self._depth.subscribe()
 
     def configure(self, config: Config) -> None:
         """Take new parameters: the map begins anew."""
@@ -130,18 +123,10 @@ class MappingComponent:
         _keep(self._windows, geometry.current, window)
         self._settle()
 
-    def _take_part(self, add: TakePart, message: Any) -> None:
-        part = read_stamped_depth(message)
-        if isinstance(part, Drop):
-            self._monitor.dropped(part)
-            return
-        for result, arrival in add(*part, self._monitor.clock()):
-            if isinstance(result, Drop):
-                self._monitor.dropped(result)
-                continue
-            self._monitor.arrived()
-            self._images[result.key] = result, arrival
-            self._settle()
+    def _take_range(self, image: RangeImage, arrival: float) -> None:
+        self._monitor.arrived()
+        self._images[image.key] = image, arrival
+        self._settle()
 
     def _settle(self) -> None:
         """Hand on what is complete, in order of time; what waits too long has no window."""

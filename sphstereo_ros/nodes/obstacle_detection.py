@@ -6,9 +6,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sphstereo_ros.core import rotations
 from sphstereo_ros.core.config import Config, ParameterError
 from sphstereo_ros.core.frames import Drop, FrameKey, RangeImage
@@ -18,15 +15,14 @@ from sphstereo_ros.core.sectors import ObstacleSectors, SectorState
 from sphstereo_ros.mavlink.encoding import MissingLibraryError
 from sphstereo_ros.mavlink.link import MavlinkLink
 from sphstereo_ros.ros import obstacle_messages, qos
-from sphstereo_ros.ros.conversions import imu_sample, odometry_sample, read_stamped_depth
+from sphstereo_ros.ros.conversions import imu_sample, odometry_sample
 from sphstereo_ros.ros.live_messages import make
-from sphstereo_ros.ros.matching import RangeMatcher
 from sphstereo_ros.ros.messages import SECOND
 from sphstereo_ros.ros.monitor import ERROR
 from sphstereo_ros.ros.shell import Output, Shell, run
+from sphstereo_ros.ros.stage import RangeInput
 from sphstereo_ros.ros.transport import SMALL_PROFILE
 
-TakePart = Callable[[FrameKey, NDArray[np.float32], float], list[tuple[RangeImage | Drop, float]]]
 # Of the least time between depth images that are used: stamps jitter.
 EARLY = 0.9
 # Comes with a workspace of PX4's.
@@ -105,7 +101,7 @@ class ObstacleDetectionComponent:
         self._detection = ObstacleDetection(shell.config, shell.mask)
         self._outputs = ObstacleOutputs(shell)
         self._attitudes = AttitudeHistory()
-        self._matcher = RangeMatcher()
+        self._depth = RangeInput(shell, self._monitor, self.offer)
         self._worker = shell.worker('obstacle_detection', self._monitor)
         self._last: FrameKey | None = None
         self._taken: int | None = None
@@ -116,10 +112,7 @@ class ObstacleDetectionComponent:
 
     def subscribe(self) -> None:
         """Take depth and motion from the graph."""
-        for topic, add in (('depth/image', self._matcher.add_range),
-                           ('depth/sigma', self._matcher.add_sigma)):
-            self._shell.input('sensor_msgs/msg/Image', topic, partial(self._take_part, add),
-                              self._monitor, qos.LARGE_RESULT)
+        self._depth.subscribe()
         self.subscribe_motion()
 
     def subscribe_motion(self) -> None:
@@ -155,17 +148,6 @@ class ObstacleDetectionComponent:
     def _is_early(self, stamp: int) -> bool:
         rate, last = self._shell.config.obstacles.max_rate, self._taken
         return rate > 0 and last is not None and 0 < stamp - last < EARLY * SECOND / rate
-
-    def _take_part(self, add: TakePart, message: Any) -> None:
-        part = read_stamped_depth(message)
-        if isinstance(part, Drop):
-            self._monitor.dropped(part)
-            return
-        for result, arrival in add(*part, self._monitor.clock()):
-            if isinstance(result, Drop):
-                self._monitor.dropped(result)
-            else:
-                self.offer(result, arrival)
 
     def _take_sample(self, topic: str, read: Callable[[Any], Any],
                      add: Callable[[Any], Drop | None], message: Any) -> None:

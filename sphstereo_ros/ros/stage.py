@@ -9,23 +9,31 @@ import numpy as np
 
 from sphstereo_ros.core import rotations
 from sphstereo_ros.core.config import Config
-from sphstereo_ros.core.frames import Drop, FrameWindow, Image8
+from sphstereo_ros.core.frames import Drop, FrameKey, FrameWindow, Image8, RangeImage
 from sphstereo_ros.ros import qos
 from sphstereo_ros.ros.conversions import (
     covariance_message,
     decode_frame,
+    read_stamped_depth,
     read_window,
     window_message,
 )
 from sphstereo_ros.ros.live_messages import make
-from sphstereo_ros.ros.matching import Covariances, WindowMatcher, frames_needed
+from sphstereo_ros.ros.matching import (
+    Covariances,
+    Pixels,
+    RangeMatcher,
+    WindowMatcher,
+    frames_needed,
+)
+from sphstereo_ros.ros.monitor import Monitor
 from sphstereo_ros.ros.shell import Shell
 
 In = TypeVar('In', bound=FrameWindow)
 Taken = TypeVar('Taken', bound=FrameWindow, contravariant=True)
 Out = TypeVar('Out', covariant=True)
 Made = TypeVar('Made')
-
+AddHalf = Callable[[FrameKey, Pixels, float], list[tuple[RangeImage | Drop, float]]]
 
 COVARIANCE = 'geometry_msgs/msg/PoseWithCovarianceStamped'
 
@@ -49,6 +57,37 @@ class WindowOutput:
                 self._covariances.send(partial(covariance_message, make, window.current.key,
                                                reference.pose))
         self._windows.send(partial(window_message, make, window))
+
+
+class RangeInput:
+    """Takes range images from the graph: depth/image and depth/sigma, joined.
+
+    take : called with each, and its time of arrival
+    """
+
+    def __init__(self, shell: Shell, monitor: Monitor,
+                 take: Callable[[RangeImage, float], None]) -> None:
+        self._shell, self._monitor = shell, monitor
+        self._take = take
+        self._matcher = RangeMatcher()
+
+    def subscribe(self) -> None:
+        """Take both halves from the graph."""
+        for topic, add in (('depth/image', self._matcher.add_range),
+                           ('depth/sigma', self._matcher.add_sigma)):
+            self._shell.input('sensor_msgs/msg/Image', topic, partial(self._take_half, add),
+                              self._monitor, qos.LARGE_RESULT)
+
+    def _take_half(self, add: AddHalf, message: Any) -> None:
+        half = read_stamped_depth(message)
+        if isinstance(half, Drop):
+            self._monitor.dropped(half)
+            return
+        for image, arrival in add(*half, self._monitor.clock()):
+            if isinstance(image, Drop):
+                self._monitor.dropped(image)
+            else:
+                self._take(image, arrival)
 
 
 class Stage(Protocol[Taken, Out]):
