@@ -3,18 +3,20 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sphstereo_ros.bench.reliability import HIDDEN, Fit, Samples, fit
 from sphstereo_ros.core.matching import UNKNOWN, Parallax, stereo_grid
 from sphstereo_ros.core.refinement import Refined
 from sphstereo_ros.core.reliability import (
+    LEAST,
     LOOKS,
     Network,
     expected_error,
     look,
     looks_at,
+    may_be_near,
     network,
     percentiles,
 )
@@ -46,7 +48,7 @@ def everywhere() -> tuple[np.ndarray, np.ndarray]:
 def errors_of(parts, baselines=BASELINES) -> tuple[np.ndarray, np.ndarray]:
     """The likely error of every pixel, and its unit."""
     told, unit = percentiles(look(*parts), GRID, baselines, network())
-    return expected_error(told, unit, parts[1], baselines), unit
+    return expected_error(told, unit, parts[1]), unit
 
 
 def outputs(looks: np.ndarray, net: Network) -> np.ndarray:
@@ -70,14 +72,32 @@ def test_the_compiled_network_is_the_network():
     error, units = errors_of(parts)
     np.testing.assert_array_equal(unit, units.ravel())
     out = outputs(looks, network())
-    likely = unit * np.exp(np.maximum(out[:, 0], out[:, 1] - 1.3))
-    nearer = unit * np.exp(out[:, 2])
-    margin = (parts[1].rho.ravel() + nearer) * min(BASELINES) * 40
-    likely = np.where(margin > 1, np.maximum(likely, 0.67 * nearer), likely)
+    by_tail = (np.exp(out[:, 1]) - LEAST) / np.exp(1.3)
+    likely = unit * np.maximum(np.maximum(np.exp(out[:, 0]) - LEAST, by_tail), 0)
     exact = np.hypot(likely, 1 / np.sqrt(parts[1].information.ravel()))
-    decided = np.abs(margin - 1) > 1e-2
-    assert (margin[decided] > 1).any()
-    np.testing.assert_allclose(error.ravel()[decided], exact[decided], rtol=2e-3)
+    np.testing.assert_allclose(error.ravel(), exact, rtol=2e-3)
+
+
+def test_the_error_is_gaussian_where_its_percentiles_are():
+    """The 68th is the standard deviation, whatever was added for the logarithm."""
+    unit = np.full((3, 4), 0.1, np.float32)
+    sigma = np.geomspace(0.001, 0.5, 12).reshape(3, 4).astype(np.float32)
+    told = np.log(np.stack([sigma, 2 * sigma, 2.05 * sigma]) + np.float32(LEAST))
+    refined = Refined(unit, np.full_like(unit, 1e12), np.zeros_like(unit))
+    np.testing.assert_allclose(expected_error(told, unit, refined), 0.1 * sigma, rtol=1e-2)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.001, 1.0), st.floats(0.01, 2.0), st.floats(0.1, 3.0), st.floats(0.01, 100))
+def test_what_may_be_near_matters_within_forty_baselines(rho, nearer, baseline, scale):
+    def found_at(s: float) -> float:
+        told = np.log(np.array([0.01, 0.02, nearer], np.float32))[:, None, None]
+        measured = np.full((1, 1), rho / s, np.float32)
+        return float(may_be_near(told, measured, measured, baseline * s)[0, 0])
+    reached = rho * (1 + nearer) * baseline * 40
+    assume(abs(reached - 1) > 1e-3)
+    assert found_at(1.0) == pytest.approx(nearer if reached > 1 else 0, rel=1e-4)
+    assert found_at(scale) == pytest.approx(found_at(1.0), rel=1e-4)
 
 
 @settings(max_examples=10, deadline=None)

@@ -23,7 +23,7 @@ from sphstereo_ros.core.reliability import look, network, percentiles
 from sphstereo_ros.core.surroundings import CHANNELS, inputs, judged
 from sphstereo_ros.scenes.sequence import true_pose
 
-ROUND = 16  # rows of half size beyond the seam
+ROUND = BLOCK = 32  # rows of half size beyond the seam; what sizes are multiples of
 
 
 def seen_at(parts, baselines=BASELINES):
@@ -73,7 +73,7 @@ def test_beyond_the_seam_comes_what_lies_there():
 
 def test_sizes_halve_evenly():
     out, seen, told, _ = seen_at(found(np.random.default_rng(3)))
-    assert out.shape[2] % 8 == out.shape[3] % 8 == 0
+    assert out.shape[2] % BLOCK == out.shape[3] % BLOCK == 0
     assert out.shape[2] >= seen.half.shape[1] + 2 * ROUND
     assert judged(out, GRID.shape).shape == told.shape
 
@@ -89,7 +89,7 @@ def test_only_what_is_relative_counts(scale, seed):
 
 
 def test_a_view_that_is_turned_is_judged_as_before():
-    """About the direction of motion; the network sees 16 px of half size beyond the seam."""
+    """About the direction of motion; the network sees 32 px of half size beyond the seam."""
     parts = found(np.random.default_rng(4))
     turn, wrap = 16, GRID.wrap
 
@@ -118,7 +118,7 @@ def test_a_view_that_is_turned_is_judged_as_before():
 def test_what_is_round_about_may_refuse_but_not_believe_alone(seed):
     own, wider = np.random.default_rng(seed).normal(size=(2, 3, 4, 5)).astype(np.float32)
     told = together(own, wider)
-    assert (told >= wider).all()
+    assert (told >= wider - 1e-6).all()
     assert (told >= 0.5 * (own + wider) - 1e-6).all()
     np.testing.assert_allclose(together(own, own), own, atol=1e-6)
 
@@ -146,7 +146,8 @@ def test_sky_behind_leaves_is_refused(monkeypatch):
         sure = (found.agreed > 0) & (found.sigma < 0.3 * found.rho)
         return (sure & (found.rho > 0.1))[sky].mean(), sure[near].mean()
     ghosts, known = believed()
-    monkeypatch.setattr(judgement, 'together', lambda own, wider: own)
-    alone, before = believed()
+    assert known > 0.85
+    # A network that believes everything leaves the decision to what a pixel tells by itself.
+    monkeypatch.setattr(judgement, 'judged', lambda x, shape: np.full((3, *shape), -9.0, 'f4'))
+    alone, _ = believed()
     assert ghosts < 0.25 * alone
-    assert known > before - 0.03

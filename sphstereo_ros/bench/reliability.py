@@ -24,7 +24,7 @@ from sphstereo_ros.core.frames import Image8, Reference, RelativePose
 from sphstereo_ros.core.joint import JointMatcher
 from sphstereo_ros.core.judgement import Found, Judged
 from sphstereo_ros.core.matching import matcher
-from sphstereo_ros.core.reliability import LEAK, LOOKS, Look, look, looks_at
+from sphstereo_ros.core.reliability import LEAK, LEAST, LOOKS, Look, look, looks_at
 from sphstereo_ros.core.rotations import exp
 from sphstereo_ros.core.warp import PolarGrid
 from sphstereo_ros.scenes.sequence import TruthFrame, load_sequence, true_pose
@@ -40,7 +40,7 @@ _WINDOWS = ((11, (1, 4, 10)), (10, (1, 4, 10)), (11, (1,)), (8, (1, 4)), (5, (1,
 _PIXELS = 60000  # of a window, even over the sphere
 _ROTATION, _DIRECTION = np.radians(0.003), np.radians(0.02)  # how far poses are off, as a rule
 PERCENTILES = (0.683, 0.954, 0.98)  # of the error twice, and of what it is too far
-LEAST, MOST = 0.003, 5.0  # of the unit: what an error counts for at least and at most
+MOST = 5.0  # of the unit: what an error counts for at most
 _RARE = 2.0  # weight of what is 10 to 100 m away
 _STEPS, _BATCH, _RATE = 12000, 4096, 3e-3
 

@@ -1,7 +1,7 @@
 """Fits the network of `sphstereo_ros.core.surroundings` to scenes with exact range.
 
     python -m sphstereo_ros.bench.surroundings render FOLDER
-    python -m sphstereo_ros.bench.surroundings fit OUT.onnx FOLDER... [--minutes M]
+    python -m sphstereo_ros.bench.surroundings fit OUT.onnx FOLDER...
 
 `render` makes scenes for it alone: of seeds that are neither tuned on nor reported, four frames
 each. `fit` needs torch and onnx (extra `fit`); the package itself does without.
@@ -9,7 +9,7 @@ each. `fit` needs torch and onnx (extra `fit`); the package itself does without.
 from __future__ import annotations
 
 import argparse
-import time
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,8 +21,8 @@ from tqdm import tqdm
 
 from sphstereo_ros.core.frames import Reference
 from sphstereo_ros.core.judgement import Found
-from sphstereo_ros.core.reliability import Look, network, percentiles
-from sphstereo_ros.core.surroundings import CHANNELS, inputs, interior
+from sphstereo_ros.core.reliability import LEAST, Look, network, percentiles
+from sphstereo_ros.core.surroundings import BLOCK, CHANNELS, inputs, interior
 from sphstereo_ros.core.warp import PolarGrid
 from sphstereo_ros.scenes.sequence import (
     TruthFrame,
@@ -33,32 +33,37 @@ from sphstereo_ros.scenes.sequence import (
 )
 
 from .accuracy import as_frame
-from .reliability import LEAST, MOST, PERCENTILES, Watched, disturbed
+from .reliability import MOST, PERCENTILES, Watched, disturbed
 
 Floats = NDArray[np.floating]
 Parameters = dict[str, Any]  # name of a layer → weight and bias
 Node = TypeVar('Node')
 
-_SEEDS = range(11, 41)
+_SEEDS = range(11, 61)
 _RENDERED = (1, 7, 10, 11)  # frames of a sequence
 # Windows by how many frames a sequence has: current frame, and the references' places.
 _WINDOWS = {4: ((3, (2, 1, 0)), (3, (2, 1))), 12: ((11, (10, 7, 1)), (8, (7, 4))),
             14: ((11, (10, 7, 1)), (8, (7, 4)))}
 # Weights of what is 10 to 100 m away, and of what is near but was found far.
 _RARE, _TOO_FAR = 2.0, 2.0
-_WIDTHS = (16, 32, 48, 64)  # channels at half size, a quarter, …
+_WIDTHS = (16, 32, 48, 64, 64, 64)  # channels at half size, a quarter, …
+_DEEPEST = len(_WIDTHS) - 1
 _LAST = 32
-LAYERS = {  # name: inputs, outputs, size of the kernel, step
-    'enter': (CHANNELS, _WIDTHS[0], 3, 1),
-    'down1': (_WIDTHS[0], _WIDTHS[1], 3, 2), 'stay1': (_WIDTHS[1], _WIDTHS[1], 3, 1),
-    'down2': (_WIDTHS[1], _WIDTHS[2], 3, 2), 'stay2': (_WIDTHS[2], _WIDTHS[2], 3, 1),
-    'down3': (_WIDTHS[2], _WIDTHS[3], 3, 2), 'stay3': (_WIDTHS[3], _WIDTHS[3], 3, 1),
-    'up2': (_WIDTHS[3], _WIDTHS[2], 1, 1), 'join2': (_WIDTHS[2], _WIDTHS[2], 3, 1),
-    'up1': (_WIDTHS[2], _WIDTHS[1], 1, 1), 'join1': (_WIDTHS[1], _WIDTHS[1], 3, 1),
-    'up0': (_WIDTHS[1], _WIDTHS[0], 1, 1), 'join0': (_WIDTHS[0], _LAST, 3, 1),
-    'tell': (_LAST, 4 * len(PERCENTILES), 1, 1)}
 _LEAK, _BEGIN = 0.1, -2.3  # logarithm of the error that it starts from
-_ROWS, _BATCH, _RATE = 128, 4, 3e-3
+_ROWS, _BATCH, _RATE = 192, 3, 3e-3
+
+
+def _layers() -> dict[str, tuple[int, int, int, int]]:
+    """Inputs, outputs, size of the kernel and step of the network's layers, by name."""
+    found = {'enter': (CHANNELS, _WIDTHS[0], 3, 1)}
+    for n, (fine, coarse) in enumerate(itertools.pairwise(_WIDTHS), 1):
+        found[f'down{n}'], found[f'stay{n}'] = (fine, coarse, 3, 2), (coarse, coarse, 3, 1)
+        found[f'up{n - 1}'] = (coarse, fine, 1, 1)
+        found[f'join{n - 1}'] = (fine, fine if n > 1 else _LAST, 3, 1)
+    return found | {'tell': (_LAST, 4 * len(PERCENTILES), 1, 1)}
+
+
+LAYERS = _layers()
 
 
 @dataclass(frozen=True)
@@ -116,13 +121,13 @@ def render(folder: Path) -> None:
         spacing = float(np.random.default_rng(seed).choice([.28, .28, .2, .4]))
         nuisance = {3: 'low_light', 4: 'exposure'}.get(seed % 5)
         jobs.append(('street', seed, spacing, nuisance))
-        jobs += [('takeoff', seed, None, None)] * (seed % 3 == 0)
+        jobs += [('takeoff', seed, None, None)] * (seed % 3 == 0 or seed > 25)
         jobs += [('corridor', seed, None, None)] * (seed % 5 == 0)
     for name, seed, step, nuisance in tqdm(jobs, unit='scene'):
         target = folder / f'{name}_{seed}'
         if target.exists():
             continue
-        height = 960 if name == 'street' and seed % 3 else 480
+        height = 960 if name != 'corridor' and seed % 3 else 480
         sequence = render_sequence(name, seed, 14, height, spacing=step, nuisance=nuisance)
         frames: list[TruthFrame] = [sequence[k] for k in _RENDERED]
         save_sequence(frames, target.with_suffix('.part'), name)
@@ -150,10 +155,10 @@ def walk(x: Node, layer: Callable[[str, Node], Node], bent: Callable[[Node], Nod
     coarse at twice the size
     """
     levels = [bent(layer('enter', x))]
-    for n in (1, 2, 3):
+    for n in range(1, _DEEPEST + 1):
         levels.append(bent(layer(f'stay{n}', bent(layer(f'down{n}', levels[-1])))))
-    y = levels[3]
-    for n in (2, 1):
+    y = levels[_DEEPEST]
+    for n in range(_DEEPEST - 1, 0, -1):
         y = bent(layer(f'join{n}', joined(layer(f'up{n}', y), levels[n])))
     y = bent(joined(layer('up0', y), levels[0]))
     return layer('tell', bent(layer('join0', y)))
@@ -190,13 +195,15 @@ def loss(out: Any, error: Any, weight: Any) -> Any:
 def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, Any, Any]:
     """A part of a patch, in another light or mirrored."""
     import torch
-    rows, columns = (n // 8 * 8 for n in patch.x.shape[1:])
-    height = min(_ROWS, rows)
-    first = int(rng.integers(0, rows - height + 1))
-    x = torch.from_numpy(patch.x[:, first:first + height, :columns].astype(np.float32))[None]
-    error, weight = (torch.from_numpy(np.ascontiguousarray(
-        m[2 * first:2 * (first + height), :2 * columns]))[None, None]
-        for m in (patch.error, patch.weight))
+    columns = patch.x.shape[2]
+    height = min(_ROWS, patch.x.shape[1] // BLOCK * BLOCK)
+    first = int(rng.integers(0, patch.x.shape[1] - height + 1))
+    beyond = -columns % BLOCK
+    part = np.pad(patch.x[:, first:first + height], ((0, 0), (0, 0), (0, beyond)), 'edge')
+    x = torch.from_numpy(part.astype(np.float32))[None]
+    rows = slice(2 * first, 2 * (first + height))
+    error, weight = (torch.from_numpy(np.pad(m[rows].astype(np.float32), (
+        (0, 0), (0, 2 * beyond))))[None, None] for m in (patch.error, patch.weight))
     gain, offset = float(np.exp(rng.normal(0, 0.25))), float(rng.normal(0, 0.3))
     x[:, 10:14] = (x[:, 10:14] * gain + offset).clamp(-2, 2)
     x[:, 23] *= gain
@@ -210,29 +217,29 @@ def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, Any, Any]:
     return x, error, weight
 
 
-def fit(patches: Sequence[Patch], minutes: float, rng: np.random.Generator) -> Parameters:
-    """Weights fitted for so long, by Adam (Kingma and Ba 2014)."""
+def fit(patches: Sequence[Patch], steps: int, rng: np.random.Generator,
+        start: dict[str, NDArray[np.float32]] | None = None) -> Parameters:
+    """Weights after so many steps of Adam (Kingma and Ba 2014), from `start` if there is one."""
     import torch
     parts = begun(torch.Generator().manual_seed(0))
+    for name, value in (start or {}).items():
+        parts[name].data.copy_(torch.from_numpy(value.copy()))
     adam = torch.optim.Adam(parts.values(), _RATE)
-    begin, number = time.monotonic(), 0
-    with tqdm(unit='step') as progress:
-        while (done := (time.monotonic() - begin) / (60 * minutes)) < 1:
-            slower = 0.5 * (1 + np.cos(np.pi * done)) + 0.002
-            adam.param_groups[0]['lr'] = _RATE * min(1, (number + 1) / 100) * slower
-            adam.zero_grad()
-            total = 0.0
-            for _ in range(_BATCH):
-                x, error, weight = _varied(patches[int(rng.integers(len(patches)))], rng)
-                x = x.contiguous(memory_format=torch.channels_last)  # four times as fast
-                part = loss(forward(parts, x), error, weight) / _BATCH
-                part.backward()
-                total += part.item()
-            torch.nn.utils.clip_grad_norm_(parts.values(), 1.0)
-            adam.step()
-            number += 1
-            progress.set_postfix(loss=round(total, 3))
-            progress.update()
+    progress = tqdm(range(steps), unit='step')
+    for number in progress:
+        slower = 0.5 * (1 + np.cos(np.pi * number / steps)) + 0.002
+        adam.param_groups[0]['lr'] = _RATE * min(1, (number + 1) / 100) * slower
+        adam.zero_grad()
+        total = 0.0
+        for _ in range(_BATCH):
+            x, error, weight = _varied(patches[int(rng.integers(len(patches)))], rng)
+            x = x.contiguous(memory_format=torch.channels_last)  # four times as fast
+            part = loss(forward(parts, x), error, weight) / _BATCH
+            part.backward()
+            total += part.item()
+        torch.nn.utils.clip_grad_norm_(parts.values(), 1.0)
+        adam.step()
+        progress.set_postfix(loss=round(total, 3))
     return parts
 
 
@@ -272,6 +279,15 @@ def as_onnx(weights: dict[str, NDArray[np.float32]]) -> bytes:
     return bytes(model.SerializeToString())
 
 
+def weights_of(model: bytes) -> dict[str, NDArray[np.float32]]:
+    """The weights in what `as_onnx` made, by name."""
+    import onnx
+    from onnx import numpy_helper
+    graph = onnx.load_from_string(model).graph
+    found = {t.name: numpy_helper.to_array(t) for t in graph.initializer}
+    return {name: value for name, value in found.items() if name.partition('.')[0] in LAYERS}
+
+
 def main() -> None:
     """Render, or fit and save."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
@@ -280,14 +296,16 @@ def main() -> None:
     fitting = commands.add_parser('fit')
     fitting.add_argument('out', type=Path)
     fitting.add_argument('folders', type=Path, nargs='+')
-    fitting.add_argument('--minutes', type=float, default=30)
+    fitting.add_argument('--steps', type=int, default=6000)
+    fitting.add_argument('--start', type=Path, help='network to go on from')
     args = parser.parse_args()
     if args.command == 'render':
         render(args.folder)
         return
     rng = np.random.default_rng(0)
     patches = [p for f in tqdm(args.folders, unit='folder') for p in patches_of(f, rng)]
-    parts = fit(patches, args.minutes, rng)
+    start = weights_of(args.start.read_bytes()) if args.start else None
+    parts = fit(patches, args.steps, rng, start)
     args.out.write_bytes(as_onnx({name: p.detach().numpy() for name, p in parts.items()}))
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from .frames import Image8
 from .matching import Parallax
 from .refinement import Refined
-from .reliability import expected_error, look, network, percentiles
+from .reliability import expected_error, look, may_be_near, network, percentiles
 from .surroundings import inputs, judged
 from .sweep import reduction
 from .warp import Map, PolarGrid
@@ -18,8 +18,9 @@ from .warp import Map, PolarGrid
 MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
 # Of the unit: a likely error with which something counts as measured; one reference alone is sure
 # of little, so more is left to the frames that follow.
-_SURE, _SURE_ALONE = 0.8, 1.2
-_SURE_BOTH, _BOTH = 0.6, 0.85  # two opinions of the error: a limit, too; together they err less
+_SURE, _SURE_ALONE, _SURE_BOTH = 0.8, 1.2, 0.6
+_NEARER, _NEARER_ALONE = 0.53, 0.8  # of the unit: what may be nearer by more is not sure
+_TAIL = 1.0  # of what is published
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
 _AGREES, _LEVELS, _SLACK = 0.05, 0.75, 1.5
@@ -61,15 +62,17 @@ def by_looks(found: Found, grid: PolarGrid, baselines: Sequence[float]) -> Judge
     One reference alone is judged pixel by pixel: what is round about was not fitted to it.
     """
     seen = look(found.view, found.refined, found.other, found.matched, found.parallax)
-    own, unit = percentiles(seen, grid, baselines, network())
-    error = expected_error(own, unit, found.refined, baselines)
-    limit = np.float32(_SURE if len(baselines) > 1 else _SURE_ALONE)
-    sure = (error < limit * unit) & (found.refined.misfit < MISFIT)
+    told, unit = percentiles(seen, grid, baselines, network())
+    error = expected_error(told, unit, found.refined)
+    sure = found.refined.misfit < MISFIT
+    limit, nearer = _SURE_ALONE, _NEARER_ALONE
     if len(baselines) > 1:
-        wider = judged(inputs(found.view, seen, own, unit, grid, baselines), grid.shape)
-        error = expected_error(together(own, wider), unit, found.refined, baselines)
-        sure &= error < np.float32(_SURE_BOTH) * unit
-        error *= np.float32(_BOTH)
+        wider = judged(inputs(found.view, seen, told, unit, grid, baselines), grid.shape)
+        sure &= error < np.float32(_SURE) * unit
+        error = expected_error(wider, unit, found.refined, _TAIL)
+        told, limit, nearer = together(told, wider), _SURE_BOTH, _NEARER
+    sure &= expected_error(told, unit, found.refined) < np.float32(limit) * unit
+    sure &= may_be_near(told, unit, found.refined.rho, min(baselines)) < np.float32(nearer)
     return Judged(found.other, error, sure.astype(np.uint8))
 
 
@@ -78,8 +81,7 @@ def together(own: NDArray[np.float32], wider: NDArray[np.float32]) -> NDArray[np
 
     What is round about may refuse what the pixel believes; what it believes by itself counts half.
     """
-    half = np.float32(0.5)
-    return np.asarray(np.maximum(wider, half * (own + wider)), np.float32)
+    return np.asarray(np.maximum(wider, np.float32(0.5) * (own + wider)), np.float32)
 
 
 def by_agreement(found: Found, other: Map, grid: PolarGrid, baseline: float,

@@ -31,10 +31,9 @@ _TEXTURE = 9
 LEAK = 0.1
 _AT_ONCE = 64  # pixels that the network judges
 _LOGARITHMS = (0, 2, 4, 6, 8, 10, 12, 14, 16, 19, 21, 23, 24, 25, 26, 27, 29)  # of the inputs
+LEAST = 0.003  # of the unit: added to an error before its logarithm is taken
 TAIL = 1.3  # logarithm of how many standard deviations the 95th percentile may be away
-# What may be much nearer is not known well, however likely the measurement is: the 98th percentile
-# counts with a share, where it means nearer than so many shortest baselines.
-_SHORT, _NEAR_BY = 0.67, 40.0
+_NEAR_BY = 40.0  # shortest baselines: nearer than that, what may be nearer than measured matters
 _LEAST_SINE = 0.02
 # No look makes up for grey that tells nothing: at least so much of what noise alone would do.
 _TOLD = 1.0
@@ -45,7 +44,8 @@ class Network:
     """Weights of the network: (LOOKS, 24), (24, 16), (16, 3) and biases, float32.
 
     Its outputs are the logarithms of the error's 68th and 95th percentile, and of the 98th
-    percentile of how much nearer than measured something is; all in units (see `expected_error`).
+    percentile of how much nearer than measured something is; all in units (see `expected_error`),
+    with LEAST added.
     """
 
     weights: tuple[Map, Map, Map]
@@ -221,16 +221,14 @@ def _percentile_rows(first: int, last: int, full: NDArray[np.float32], half: NDA
 
 
 @fast_kernel
-def _error_rows(first: int, last: int, told: NDArray[np.float32], rho: Map, information: Map,
-                units: Map, shortest: np.float32,
-                out: Map) -> None:  # pragma: no cover - compiled
+def _error_rows(first: int, last: int, told: NDArray[np.float32], information: Map, units: Map,
+                share: np.float32, out: Map) -> None:  # pragma: no cover - compiled
+    least = np.float32(LEAST)
     for i in range(first, last):
-        for j in range(rho.shape[1]):
+        for j in range(units.shape[1]):
             unit = units[i, j]
-            likely = unit * np.exp(max(told[0, i, j], told[1, i, j] - np.float32(TAIL)))
-            nearer = unit * np.exp(told[2, i, j])
-            if (rho[i, j] + nearer) * shortest * np.float32(_NEAR_BY) > np.float32(1):
-                likely = max(likely, nearer * np.float32(_SHORT))
+            likely = unit * max(max(np.exp(told[0, i, j]) - least,
+                                    (np.exp(told[1, i, j]) - least) * share), np.float32(0))
             noise = np.float32(_TOLD * _TOLD) / max(information[i, j], np.float32(1e-9))
             out[i, j] = np.sqrt(likely * likely + noise)
 
@@ -270,17 +268,29 @@ def percentiles(seen: Look, grid: PolarGrid, baselines: Sequence[float],
 
 
 def expected_error(told: NDArray[np.float32], unit: Map, refined: Refined,
-                   baselines: Sequence[float]) -> Map:
+                   tail: float = TAIL) -> Map:
     """Standard deviation of the inverse range, 1/m, that goes with such percentiles.
 
     told, unit : of `percentiles`
     refined : the measurement
-    baselines : of the references, m
+    tail : logarithm of how many standard deviations the 95th percentile may be away
     """
     out = np.empty(unit.shape, np.float32)
-    rows_in_parallel(_error_rows, len(out), told, refined.rho, refined.information, unit,
-                     np.float32(min(baselines)), out)
+    rows_in_parallel(_error_rows, len(out), told, refined.information, unit,
+                     np.float32(math.exp(-tail)), out)
     return out
+
+
+def may_be_near(told: NDArray[np.float32], unit: Map, rho: Map, shortest: float) -> Map:
+    """How much nearer than measured something may be, in units; 0 where that is far away still.
+
+    told, unit : of `percentiles`
+    rho : measured, 1/m
+    shortest : of the baselines, m
+    """
+    nearer = np.exp(told[2])
+    near = (rho + nearer * unit) * np.float32(_NEAR_BY * shortest) > 1
+    return np.asarray(nearer * near, np.float32)
 
 
 def looks_at(seen: Look, grid: PolarGrid, baselines: Sequence[float], rows: NDArray[np.int64],

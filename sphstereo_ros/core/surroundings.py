@@ -25,8 +25,8 @@ from .reliability import TAIL, Look, _geometry
 from .warp import Map, PolarGrid
 
 CHANNELS = 25
-_BLOCK = 8  # px at half size: what the network halves three times
-_ROUND = 16  # px at half size that it sees beyond the seam
+BLOCK = 32  # px at half size: what the network halves five times
+_ROUND = 32  # px at half size that it sees beyond the seam
 _LOCK = threading.Lock()
 
 
@@ -92,7 +92,7 @@ def inputs(view: Image8, seen: Look, told: NDArray[np.float32], unit: Map, grid:
 
     """
     rows, columns = seen.half.shape[1:]
-    size = [-(-n // _BLOCK) * _BLOCK for n in (rows + 2 * _ROUND, columns)]
+    size = [-(-n // BLOCK) * BLOCK for n in (rows + 2 * _ROUND, columns)]
     out = np.empty((1, CHANNELS, *size), np.float32)
     rows_in_parallel(_input_rows, size[0], view, seen.full, seen.half, told, unit,
                      *_geometry(grid, baselines), grid.wrap // 2, out)
