@@ -19,7 +19,7 @@ MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
 # Of the unit: a likely error with which something counts as measured; one reference alone is sure
 # of little, so more is left to the frames that follow.
 _SURE, _SURE_ALONE, _SURE_BOTH = 0.8, 1.2, 0.6
-_NEARER, _NEARER_ALONE = 0.53, 0.7  # of the unit: what may be nearer by more is not sure
+_NEARER, _NEARER_ALONE = 0.53, 0.6  # of the unit: what may be nearer by more is not sure
 _TAIL = 1.0  # of what is published
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
