@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from polar_views import PolarView, polar_view
 
 from sphstereo_ros.core.frames import RelativePose
-from sphstereo_ros.core.guided_sweep import _fine_levels, guided_sweep, planes
+from sphstereo_ros.core.guided_sweep import _fine_levels, _nearest, guided_sweep, planes
 from sphstereo_ros.core.joint import JointMatcher
 from sphstereo_ros.core.refinement import JointRefinement
 from sphstereo_ros.core.sweep import MOST_LEVELS
@@ -121,11 +121,20 @@ def test_planes_are_found_and_what_bends_is_not():
 
 
 @settings(deadline=None)
-@given(st.lists(st.floats(0.02, 30.0), min_size=1, max_size=10), st.integers(16, 2048))
-def test_levels_get_coarser_before_the_nearest_are_left_out(baselines, height):
-    found = _fine_levels(baselines, np.pi / height)
+@given(st.lists(st.floats(0.02, 30.0), min_size=1, max_size=10), st.integers(16, 2048),
+       st.floats(0.01, 10.0))
+def test_levels_get_coarser_before_the_nearest_are_left_out(baselines, height, nearest):
+    found = _fine_levels(baselines, np.pi / height, nearest)
     assert 3 <= len(found) < MOST_LEVELS
-    assert found[-1] >= min(1 / 0.3, 2 / min(baselines))
+    assert found[-1] >= min(nearest, 1 / 0.3, 2 / min(baselines))
+
+
+def test_what_is_nearer_than_all_levels_stays_where_it_is_known_to_be(posts):
+    view, known = posts, posts.rho().copy()
+    known[40:44] = 2.0  # two pixels wide at half size: too narrow to ask for levels
+    found = guided_sweep(view.image, view.grid, view.axes, view.pairs, known).rho
+    assert _nearest(known[::2, ::2], view.pairs[0][1].baseline) < 1.9
+    np.testing.assert_allclose(found[20:22], 2.0)
 
 
 def test_the_number_of_threads_does_not_matter(monkeypatch):

@@ -16,11 +16,11 @@ from sphstereo_ros.core.sphere import polar_bearings
 from sphstereo_ros.core.sweep import (
     _across_rows,
     _along_rows,
-    _census_rows,
-    _different_bits,
+    _difference,
     _scale_rows,
     levels,
     reduction,
+    signature,
     sweep,
 )
 from sphstereo_ros.core.warp import PolarGrid
@@ -92,21 +92,30 @@ def test_levels_of_one_baseline_reach_to_the_nearest_that_matters(baseline, heig
 def test_census_has_a_bit_for_every_brighter_neighbour():
     rng = np.random.default_rng(1)
     image = rng.integers(0, 6, (20, 31), np.uint8)  # with ties
-    got = np.empty(image.shape, np.uint32)
-    _census_rows(0, 20, image, got)
     padded = np.pad(image, 2, mode='edge')
     wanted = np.zeros(image.shape, np.uint32)
     for di in range(5):
         for dj in range(5):
             if (di, dj) != (2, 2):
                 wanted = wanted << 1 | (padded[di:di + 20, dj:dj + 31] > image)
-    np.testing.assert_array_equal(got, wanted)
+    np.testing.assert_array_equal(signature(image) >> 8, wanted)
+
+
+def test_the_last_byte_tells_brighter_from_darker_than_round_about():
+    image = np.full((40, 40), 90, np.uint8)
+    image[20, 20], image[5, 5] = 150, 40
+    contrast = (signature(image) & 255).astype(int) - 128
+    assert contrast[20, 20] == pytest.approx(60, abs=1)
+    assert contrast[5, 5] == pytest.approx(-50, abs=1)
+    assert contrast[30, 8] == 0
 
 
 @settings(deadline=None)
-@given(st.integers(0, 2**24 - 1), st.integers(0, 2**24 - 1))
-def test_different_bits_are_counted(a, b):
-    assert _different_bits(np.uint32(a), np.uint32(b)) == (a ^ b).bit_count()
+@given(st.integers(0, 2**32 - 1), st.integers(0, 2**32 - 1))
+def test_bits_that_differ_cost_two_and_contrast_half_a_grey_level_up_to_a_limit(a, b):
+    contrast = min(abs((a & 255) - (b & 255)) // 2, 12)
+    wanted = 2 * (a >> 8 ^ b >> 8).bit_count() + contrast
+    assert _difference(np.uint32(a), np.uint32(b)) == wanted
 
 
 def test_costs_are_scaled_to_bytes_and_the_volume_is_emptied():

@@ -21,22 +21,20 @@ from .frames import Image8, RelativePose
 from .jit import kernel, rows_in_parallel
 from .sweep import (
     _BANDS,
-    _CONTRAST,
-    _CONTRAST_LIMIT,
     _FREE,
     MOST_LEVELS,
-    Census,
     Floats,
+    Signature,
     Volume,
     _advance,
-    _different_bits,
+    _difference,
     _jump,
     _seen,
     _shrunk,
-    _view,
     _winner_rows,
     levels,
     reduction,
+    signature,
 )
 from .warp import Map, PolarGrid
 
@@ -51,6 +49,9 @@ _PLANE, _FLAT, _BEND = 12, 1.5, 0.15  # px round about; levels off a plane: and 
 _UNKNOWN = 10000  # level of what is no plane
 _STEEP = 3  # levels a pixel that a plane falls at most
 _WORST = np.uint16(255)
+# Levels go as near as what is known to be nearest (px across), and beyond; and at least to so much
+# of the nearest baseline over range.
+_SPOT, _BEYOND, _AT_LEAST = 3, 1.25, 0.25
 # Penalties for a change by more than a level: less, from _JUMP to _EDGE, where grey changes.
 _JUMP, _EDGE = 300, 80
 
@@ -64,20 +65,21 @@ class Swept:
 
 
 @kernel
-def _cost_rows(first: int, last: int, census: Census, contrast: Bytes, seen_census: Census,
-               seen_contrast: Bytes, row: Map, column: Map, table: Map, used: NDArray[np.int64],
-               known: Map, cost: Bytes) -> None:  # pragma: no cover - compiled
+def _cost_rows(first: int, last: int, here: Signature, there: Signature, row: Map, column: Map,
+               table: Map, used: NDArray[np.int64], known: Map,
+               cost: Bytes) -> None:  # pragma: no cover - compiled
     """Mean of the two least costs of a level, (rows, columns, levels), and what holds it.
 
-    seen_census … used : of all references, as in `sweep._Seen`, one after the other
+    there … used : of all references, as in `sweep._Seen`, one after the other
     """
-    count, rows, columns = seen_census.shape
-    half = np.float32(0.5)
+    count, rows, columns = there.shape
+    half, end = np.float32(0.5), np.int32(columns - 1)
     least, second, found = (np.empty(cost.shape[2], np.uint16), np.empty(cost.shape[2], np.uint16),
                             np.empty(cost.shape[2], np.uint16))
+    met = np.empty(cost.shape[2], np.uint32)
     for i in range(first, last):
-        for j in range(census.shape[1]):
-            here, grey = census[i, j], np.int32(contrast[i, j])
+        for j in range(here.shape[1]):
+            own = here[i, j]
             least[:] = _WORST
             second[:] = _WORST
             for n in range(count):
@@ -85,11 +87,11 @@ def _cost_rows(first: int, last: int, census: Census, contrast: Bytes, seen_cens
                 at = min(max(int(column[n, i, j] + half), 0), table.shape[1] - 1)
                 offset = column[n, i, j] - np.float32(at) + half
                 for k in range(used[n]):
-                    c = min(max(int(table[n, at, k] + offset), 0), columns - 1)
-                    bits = 2 * _different_bits(here, seen_census[n, r, c])
-                    off = int(abs(grey - np.int32(seen_contrast[n, r, c])) * _CONTRAST) >> 3
-                    found[k] = np.uint16(bits + min(off, _CONTRAST_LIMIT))
-                for k in range(used[n]):  # a loop of its own runs in vectors
+                    c = min(max(np.int32(table[n, at, k] + offset), np.int32(0)), end)
+                    met[k] = there[n, r, c]
+                for k in range(used[n]):  # loops of their own run in vectors
+                    found[k] = np.uint16(_difference(own, met[k]))
+                for k in range(used[n]):
                     second[k] = min(second[k], max(least[k], found[k]))
                     least[k] = min(least[k], found[k])
             for k in range(cost.shape[2]):
@@ -173,14 +175,20 @@ def planes(known: Map) -> Levels:
     return level
 
 
-def _fine_levels(baselines: Sequence[float], pixel: float) -> Floats:
-    """Levels that reach as near as they should, as fine as their number allows."""
+def _fine_levels(baselines: Sequence[float], pixel: float, nearest: float) -> Floats:
+    """Levels up to the inverse range `nearest`, as fine as their number allows."""
     step = _LEVEL
-    found = levels(baselines, pixel, step)
+    found = levels(baselines, pixel, step, nearest)
     while len(found) == MOST_LEVELS:
         step *= _COARSER
-        found = levels(baselines, pixel, step)
+        found = levels(baselines, pixel, step, nearest)
     return found
+
+
+def _nearest(known: Map, baseline: float) -> float:
+    """Inverse range to which there must be levels: beyond it, they would only mislead."""
+    spot = np.ones((_SPOT, _SPOT), np.uint8)
+    return max(_BEYOND * float(cv2.erode(known, spot).max()), _AT_LEAST / baseline)
 
 
 def _all_seen(references: Sequence[tuple[Image8, RelativePose]], half: PolarGrid, axes: Floats,
@@ -204,22 +212,24 @@ def guided_sweep(current: Image8, grid: PolarGrid, axes: Floats,
     """
     by = reduction(grid.height)
     half = PolarGrid(grid.height // by, grid.margin // by, grid.wrap // by)
-    view = _view(_shrunk(current, by))
-    level = _fine_levels([p.baseline for _, p in references], half.pixel)
-    seen = _all_seen(references, half, axes, by, level)
+    view = _shrunk(current, by)
     small = cv2.resize(known, half.shape[::-1], interpolation=cv2.INTER_AREA)
+    baselines = [p.baseline for _, p in references]
+    level = _fine_levels(baselines, half.pixel, _nearest(small, baselines[0]))
+    seen = _all_seen(references, half, axes, by, level)
     number = np.arange(level.size)
     cost = np.empty((*half.shape, level.size), np.uint8)
-    rows_in_parallel(_cost_rows, len(cost), view.census, view.contrast, *seen,
+    rows_in_parallel(_cost_rows, len(cost), signature(view), *seen,
                      np.interp(small, level, number).astype(np.float32), cost)
     smooth = np.interp(cv2.medianBlur(small, 5), level, number).astype(np.float32)
     plane, total = planes(smooth), np.zeros(cost.shape, np.uint16)
-    rows_in_parallel(_along_rows, len(cost), cost, view.image, plane, total)
+    rows_in_parallel(_along_rows, len(cost), cost, view, plane, total)
     for slant in (0, 1, -1):
-        rows_in_parallel(_across_rows, cost.shape[1], cost, view.image, plane, slant, total,
+        rows_in_parallel(_across_rows, cost.shape[1], cost, view, plane, slant, total,
                          pieces=_BANDS)
     out = np.empty(half.shape, np.float32)
     rows_in_parallel(_winner_rows, len(total), total, level.astype(np.float32), out)
     out = np.asarray(cv2.medianBlur(out, 3))
+    out = np.where(small > level[-1], small, out)
     step = np.interp(out, level[:-1], np.diff(level)).astype(np.float32)
     return Swept(out, step)

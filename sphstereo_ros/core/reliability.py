@@ -122,7 +122,7 @@ def _between(value: Any, low: float,
 def _inputs(full: NDArray[np.float32], half: NDArray[np.float32], i: int, j: int,
             sine: np.float32, scale: Map, p: int, x: Map,
             units: Map) -> None:  # pragma: no cover - compiled
-    """Fill column p of `x` (LOOKS, pixels), before `_logarithms`, and p of `units`, 1/m.
+    """Fill column p of `x` (LOOKS, pixels), before `logarithms`, and p of `units`, 1/m.
 
     scale : rad of a pixel, shortest and longest baseline
     """
@@ -159,10 +159,10 @@ def _inputs(full: NDArray[np.float32], half: NDArray[np.float32], i: int, j: int
 
 
 @fast_kernel
-def _logarithms(x: Map) -> None:  # pragma: no cover - compiled
-    """Replace the rows of `x` that are logarithms; to 2e-5, by the bits of what is positive."""
+def logarithms(x: Map, which: tuple[int, ...]) -> None:  # pragma: no cover - compiled
+    """Replace the rows `which` of `x`, all positive, by their logarithms: to 2e-5, by bits."""
     bits = x.view(np.int32)
-    for k in _LOGARITHMS:
+    for k in which:
         for p in range(x.shape[1]):
             exponent = np.float32((bits[k, p] >> 23) - 127)
             bits[k, p] = (bits[k, p] & 0x7FFFFF) | 0x3F800000
@@ -209,7 +209,7 @@ def _percentile_rows(first: int, last: int, full: NDArray[np.float32], half: NDA
             start = min(block, sine.size - pixels)
             for p in range(pixels):
                 _inputs(full, half, i, start + p, sine[start + p], scale, p, x, unit)
-            _logarithms(x)
+            logarithms(x, _LOGARITHMS)
             _layer(x, w0, b0, True, y)
             _layer(y, w1, b1, True, z)
             _layer(z, w2, b2, False, end)
@@ -240,7 +240,7 @@ def _looks_at(full: NDArray[np.float32], half: NDArray[np.float32], rows: NDArra
     x, one = np.ones((LOOKS, 1), np.float32), np.empty(1, np.float32)
     for n in range(rows.size):
         _inputs(full, half, rows[n], columns[n], sine[columns[n]], scale, 0, x, one)
-        _logarithms(x)
+        logarithms(x, _LOGARITHMS)
         out[n], unit[n] = x[:, 0], one[0]
 
 

@@ -21,61 +21,86 @@ from numpy.typing import NDArray
 from .frames import Image8
 from .jit import fast_kernel, rows_in_parallel
 from .matching import UNKNOWN
-from .reliability import TAIL, Look, _geometry
+from .reliability import TAIL, Look, _geometry, logarithms
 from .warp import Map, PolarGrid
 
 CHANNELS = 25
 BLOCK = 32  # px at half size: what the network halves five times
 _ROUND = 32  # px at half size that it sees beyond the seam
+_LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24)  # of the inputs
 _LOCK = threading.Lock()
+
+
+@fast_kernel
+def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
+           told: NDArray[np.float32], units: Map, sine: Map, scale: Map, h: int, w: int, x: Map,
+           p: int) -> None:  # pragma: no cover - compiled
+    """Fill column p of `x` (CHANNELS, pixels) of the pixel (h, w) at half size, before logarithms.
+    """
+    one, quarter = np.float32(1), np.float32(0.25)
+    sign = swept = differs = known = moved = np.float32(0)
+    nearer = misfit = information = longest = sines = np.float32(0)
+    low, high = np.float32(255), np.float32(0)
+    for n in range(4):
+        r, c = 2 * h + (n >> 1), 2 * w + (n & 1)
+        rho, other, matched = full[0, r, c], full[1, r, c], full[2, r, c]
+        unit, s = units[r, c], sine[c]
+        per = one / unit
+        matches = one if matched != np.float32(UNKNOWN) else np.float32(0)
+        pixels = unit * s / scale[0]
+        x[n, p] = max(told[0, r, c], told[1, r, c] - np.float32(TAIL))
+        nearer += told[2, r, c]
+        x[5 + n, p] = np.float32(0.1) + pixels * scale[1]
+        sign += min(max(rho * per, -one), one)
+        grey = (np.float32(view[r, c]) - np.float32(128)) * np.float32(1 / 64)
+        x[10 + n, p] = grey
+        low, high = min(low, grey), max(high, grey)
+        swept += max(other * s / scale[0] * scale[1], np.float32(0))
+        differs += min(max((rho - other) * per, np.float32(-2)), np.float32(1.5))
+        known += matches
+        moved += matches * min(max((rho - matched) * per, np.float32(-2)), np.float32(1.5))
+        misfit += full[3, r, c]
+        information += full[4, r, c] * unit * unit
+        longest += pixels * scale[2]
+        sines += s
+    x[4, p], x[9, p] = quarter * nearer, quarter * sign
+    x[14, p] = np.float32(0.5) + half[12, h, w]
+    x[15, p] = np.float32(0.1) + quarter * swept
+    x[16, p], x[17, p], x[18, p] = quarter * differs, quarter * known, quarter * moved
+    x[19, p] = np.float32(4) + quarter * misfit
+    x[20, p] = np.float32(0.01) + quarter * information
+    x[21, p] = np.float32(0.1) + quarter * longest
+    x[22, p], x[23, p] = quarter * sines, high - low
+    x[24, p] = np.float32(0.05) + half[13, h, w]
 
 
 @fast_kernel
 def _input_rows(first: int, last: int, view: Image8, full: NDArray[np.float32],
                 half: NDArray[np.float32], told: NDArray[np.float32], units: Map, sine: Map,
                 scale: Map, wrap: int, out: NDArray[np.float32]) -> None:  # pragma: no cover
-    """Rows of `out` (1, CHANNELS, …): half size, on round the sphere, at the end as the last."""
+    """Rows of `out` (1, CHANNELS, …): half size, on round the sphere, at the end as the last.
+
+    By blocks of pixels: rows of channels lie a power of two apart, and push each other out of
+    the cache.
+    """
     rows, columns = half.shape[1], half.shape[2]
-    one, quarter = np.float32(1), np.float32(0.25)
+    x = np.empty((CHANNELS, BLOCK), np.float32)
     for i in range(first, last):
         h = (i - _ROUND - wrap) % (rows - 2 * wrap) + wrap
-        for j in range(out.shape[3]):
-            w = min(j, columns - 1)
-            x = out[0, :, i, j]
-            for k in range(9, CHANNELS):
-                x[k] = np.float32(0)
-            x[4] = np.float32(0)
-            low, high = np.float32(255), np.float32(0)
-            for n in range(4):
-                r, c = 2 * h + (n >> 1), 2 * w + (n & 1)
-                rho, other, matched = full[0, r, c], full[1, r, c], full[2, r, c]
-                unit, s = units[r, c], sine[c]
-                known = one if matched != np.float32(UNKNOWN) else np.float32(0)
-                x[n] = max(told[0, r, c], told[1, r, c] - np.float32(TAIL))
-                x[4] += quarter * told[2, r, c]
-                pixels = unit * s / scale[0]
-                x[5 + n] = np.log(np.float32(0.1) + pixels * scale[1])
-                x[9] += quarter * min(max(rho / unit, -one), one)
-                grey = (np.float32(view[r, c]) - np.float32(128)) / np.float32(64)
-                x[10 + n] = grey
-                low, high = min(low, grey), max(high, grey)
-                x[15] += quarter * max(other * s / scale[0] * scale[1], np.float32(0))
-                x[16] += quarter * min(max((rho - other) / unit, np.float32(-2)),
-                                       np.float32(1.5))
-                x[17] += quarter * known
-                x[18] += quarter * known * min(max((rho - matched) / unit, np.float32(-2)),
-                                               np.float32(1.5))
-                x[19] += quarter * full[3, r, c]
-                x[20] += quarter * full[4, r, c] * unit * unit
-                x[21] += quarter * pixels * scale[2]
-                x[22] += quarter * s
-            x[14] = np.log(np.float32(0.5) + half[12, h, w]) - one
-            x[15] = np.log(np.float32(0.1) + x[15])
-            x[19] = np.float32(0.7) * (np.log(np.float32(4) + x[19]) - np.float32(3))
-            x[20] = np.float32(0.2) * np.log(np.float32(0.01) + x[20])
-            x[21] = np.float32(0.5) * np.log(np.float32(0.1) + x[21])
-            x[23] = high - low
-            x[24] = np.log(np.float32(0.05) + half[13, h, w]) + one
+        for start in range(0, out.shape[3], BLOCK):
+            for p in range(BLOCK):
+                _input(view, full, half, told, units, sine, scale, h,
+                       min(start + p, columns - 1), x, p)
+            logarithms(x, _LOGARITHMS)
+            for p in range(BLOCK):
+                x[14, p] -= np.float32(1)
+                x[19, p] = np.float32(0.7) * (x[19, p] - np.float32(3))
+                x[20, p] *= np.float32(0.2)
+                x[21, p] *= np.float32(0.5)
+                x[24, p] += np.float32(1)
+            for k in range(CHANNELS):
+                for p in range(BLOCK):
+                    out[0, k, i, start + p] = x[k, p]
 
 
 def inputs(view: Image8, seen: Look, told: NDArray[np.float32], unit: Map, grid: PolarGrid,

@@ -10,7 +10,6 @@ the column. Done at half size: what it finds is a start or a second opinion, not
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -23,7 +22,7 @@ from .sphere import polar_axes
 from .warp import Map, PolarGrid, _arctan2, polar_map, resample, with_border
 
 Floats = NDArray[np.float64]
-Census = NDArray[np.uint32]
+Signature = NDArray[np.uint32]
 Volume = NDArray[np.uint16]
 
 _MARGIN = 8
@@ -41,41 +40,33 @@ _STEP, _JUMP, _EDGE, _EDGE_GREY = 10, 200, 40, 8
 _FREE = 60000  # beyond the first and the last level
 
 
-@dataclass(frozen=True)
-class _View:
-    """A view on a polar grid at half size: census of each pixel, and its contrast as uint8."""
-
-    image: Image8
-    census: Census
-    contrast: Image8
-
-
 class _Seen(NamedTuple):
     """A reference on a polar grid of its own, about its own direction of motion.
 
-    census, contrast : of that grid's pixels
+    signature : of that grid's pixels
     row, column : where on it each pixel of the current grid is seen if it is far away
     table : (columns, levels) column that a column moves to at a level
     used : number of levels at which the reference takes part
     """
 
-    census: Census
-    contrast: Image8
+    signature: Signature
     row: Map
     column: Map
     table: Map
     used: int
 
 
-def levels(baselines: Sequence[float], pixel: float, step: float = _LEVEL) -> Floats:
+def levels(baselines: Sequence[float], pixel: float, step: float = _LEVEL,
+           nearest: float = 1 / _NEAREST) -> Floats:
     """Inverse ranges (N,), 1/m, at even steps of parallax of the longest baseline that sees well.
 
     The first two are beyond infinity: what lies at infinity has neighbours on both sides.
     step : px of parallax between levels
+    nearest : 1/m, the last level at the latest
     """
     longest_first = sorted(baselines, reverse=True)
     found = [-2 * step * pixel / longest_first[0]]
-    nearest = min(1 / _NEAREST, _CLOSEST / longest_first[-1])
+    nearest = min(nearest, 1 / _NEAREST, _CLOSEST / longest_first[-1])
     while found[-1] < nearest and len(found) < MOST_LEVELS:
         usable = [b for b in longest_first if found[-1] * b <= REACH] or longest_first[-1:]
         near = found[-1] * usable[0] > REACH
@@ -84,9 +75,9 @@ def levels(baselines: Sequence[float], pixel: float, step: float = _LEVEL) -> Fl
 
 
 @kernel
-def _census_rows(first: int, last: int, image: Image8,
-                 out: Census) -> None:  # pragma: no cover - compiled
-    """Which of the 24 neighbours within two pixels are brighter."""
+def _signature_rows(first: int, last: int, image: Image8, contrast: Image8,
+                    out: Signature) -> None:  # pragma: no cover - compiled
+    """Which of the 24 neighbours within two pixels are brighter, and in the last byte contrast."""
     rows, columns = image.shape
     for i in range(first, last):
         for j in range(columns):
@@ -98,15 +89,16 @@ def _census_rows(first: int, last: int, image: Image8,
                         continue
                     jj = min(max(j + dj, 0), columns - 1)
                     bits = (bits << np.uint32(1)) | np.uint32(image[ii, jj] > image[i, j])
-            out[i, j] = bits
+            out[i, j] = (bits << np.uint32(8)) | np.uint32(contrast[i, j])
 
 
-def _view(image: Image8) -> _View:
-    census = np.empty(image.shape, np.uint32)
-    rows_in_parallel(_census_rows, len(image), image, census)
+def signature(image: Image8) -> Signature:
+    """Census of each pixel (24 bits) and its contrast with what is round about (the last byte)."""
     mean = cv2.blur(image, (_BLUR, _BLUR))
-    contrast = cv2.addWeighted(image, 1.0, mean, -1.0, 128.0)
-    return _View(image, census, np.asarray(contrast, np.uint8))
+    contrast = np.asarray(cv2.addWeighted(image, 1.0, mean, -1.0, 128.0), np.uint8)
+    out = np.empty(image.shape, np.uint32)
+    rows_in_parallel(_signature_rows, len(image), image, contrast, out)
+    return out
 
 
 @kernel
@@ -130,33 +122,37 @@ def _place_rows(first: int, last: int, cos_theta: Map, sin_theta: Map, cos_azimu
 
 
 @kernel
-def _different_bits(a: np.uint32, b: np.uint32) -> np.int32:  # pragma: no cover - compiled
-    v = np.uint32(a ^ b)
+def _difference(a: np.uint32, b: np.uint32) -> np.int32:  # pragma: no cover - compiled
+    """Cost of two signatures: bits that differ, and grey levels of contrast up to a limit."""
+    v = np.uint32(np.uint32(a ^ b) >> np.uint32(8))
     v = np.uint32(v - np.uint32(np.uint32(v >> np.uint32(1)) & np.uint32(0x55555555)))
     v = np.uint32((v & np.uint32(0x33333333))
                   + np.uint32(np.uint32(v >> np.uint32(2)) & np.uint32(0x33333333)))
     v = np.uint32(np.uint32(v + np.uint32(v >> np.uint32(4))) & np.uint32(0x0F0F0F0F))
-    return np.int32(np.uint32(v * np.uint32(0x01010101)) >> np.uint32(24))
+    bits = np.int32(np.uint32(v * np.uint32(0x01010101)) >> np.uint32(24))
+    off = abs(np.int32(a & np.uint32(255)) - np.int32(b & np.uint32(255)))
+    off = np.int32(np.int32(off * np.int32(_CONTRAST)) >> np.int32(3))
+    return np.int32(bits + bits + min(off, np.int32(_CONTRAST_LIMIT)))
 
 
 @kernel
-def _cost_rows(first: int, last: int, census: Census, contrast: Image8, ref_census: Census,
-               ref_contrast: Image8, row: Map, column: Map, table: Map, used: int,
-               cost: Volume) -> None:  # pragma: no cover - compiled
+def _cost_rows(first: int, last: int, here: Signature, there: Signature, row: Map, column: Map,
+               table: Map, used: int, cost: Volume) -> None:  # pragma: no cover - compiled
     """Add one reference's cost at every level to `cost` (rows, columns, levels)."""
-    rows, columns = ref_census.shape
-    half = np.float32(0.5)
+    rows, columns = there.shape
+    half, end = np.float32(0.5), np.int32(columns - 1)
+    met = np.empty(used, np.uint32)
     for i in range(first, last):
-        for j in range(census.shape[1]):
+        for j in range(here.shape[1]):
             r = min(max(int(row[i, j] + half), 0), rows - 1)
             at = min(max(int(column[i, j] + half), 0), table.shape[0] - 1)
             offset = column[i, j] - np.float32(at) + half
-            here, grey = census[i, j], np.int32(contrast[i, j])
+            own = here[i, j]
             for k in range(used):
-                c = min(max(int(table[at, k] + offset), 0), columns - 1)
-                bits = 2 * _different_bits(here, ref_census[r, c])
-                off = int(abs(grey - np.int32(ref_contrast[r, c])) * _CONTRAST) >> 3
-                cost[i, j, k] += np.uint16(bits + min(off, _CONTRAST_LIMIT))
+                c = min(max(np.int32(table[at, k] + offset), np.int32(0)), end)
+                met[k] = there[r, c]
+            for k in range(used):  # a loop of its own runs in vectors
+                cost[i, j, k] += np.uint16(_difference(own, met[k]))
             for k in range(used, cost.shape[2]):
                 cost[i, j, k] += np.uint16(_UNSEEN)
 
@@ -246,10 +242,12 @@ def _winner_rows(first: int, last: int, total: Volume, level: Map,
     count = level.size
     for i in range(first, last):
         for j in range(total.shape[1]):
-            best = 0
+            lowest = total[i, j, 0]
             for k in range(1, count):
-                if total[i, j, k] < total[i, j, best]:
-                    best = k
+                lowest = min(lowest, total[i, j, k])
+            best = 0
+            while total[i, j, best] != lowest:
+                best += 1
             value = level[best]
             if 0 < best < count - 1:
                 left, right = np.float32(total[i, j, best - 1]), np.float32(total[i, j, best + 1])
@@ -299,10 +297,10 @@ def _seen(image: Image8, pose: RelativePose, grid: PolarGrid, axes: Floats, leve
     nearest : it takes part at every level
     """
     own_grid, own_axes = PolarGrid(grid.height, _MARGIN, _MARGIN), polar_axes(pose.direction)
-    view = _view(np.asarray(resample(with_border(image), polar_map(
-        own_grid, pose.rotation.T @ own_axes, image.shape)), np.uint8))
+    view = np.asarray(resample(with_border(image), polar_map(
+        own_grid, pose.rotation.T @ own_axes, image.shape)), np.uint8)
     used = level.size if nearest else int(np.searchsorted(level, REACH / pose.baseline))
-    return _Seen(view.census, view.contrast, *_placed(grid, own_grid, own_axes.T @ axes),
+    return _Seen(signature(view), *_placed(grid, own_grid, own_axes.T @ axes),
                  _polar_table(own_grid, level, pose.baseline), used)
 
 
@@ -325,19 +323,20 @@ def sweep(current: Image8, grid: PolarGrid, axes: Floats,
     """
     by = reduction(grid.height)
     half = PolarGrid(grid.height // by, grid.margin // by, grid.wrap // by)
-    view = _view(_shrunk(current, by))
+    view = _shrunk(current, by)
+    own = signature(view)
     baselines = [pose.baseline for _, pose in references]
     level = levels(baselines, half.pixel)
-    total = np.zeros((*view.image.shape, level.size), np.uint16)
+    total = np.zeros((*view.shape, level.size), np.uint16)
     for image, pose in references:
         seen = _seen(_shrunk(image, by), pose, half, axes, level, pose is references[0][1])
-        rows_in_parallel(_cost_rows, len(total), view.census, view.contrast, *seen, total)
+        rows_in_parallel(_cost_rows, len(total), own, *seen, total)
     cost = np.empty(total.shape, np.uint8)
     rows_in_parallel(_scale_rows, len(total), total, 2.0 / len(references), cost)
-    rows_in_parallel(_along_rows, len(total), cost, view.image, total)
+    rows_in_parallel(_along_rows, len(total), cost, view, total)
     for slant in (0, 1, -1):
-        rows_in_parallel(_across_rows, total.shape[1], cost, view.image, slant, total,
+        rows_in_parallel(_across_rows, total.shape[1], cost, view, slant, total,
                          pieces=_BANDS)
-    out = np.empty(view.image.shape, np.float32)
+    out = np.empty(view.shape, np.float32)
     rows_in_parallel(_winner_rows, len(total), total, level.astype(np.float32), out)
     return cv2.medianBlur(out, 3), float(level[1] - level[0])
