@@ -17,13 +17,13 @@ NEAR = 0.2  # 1/m
 PATCH = (slice(20, 40), slice(50, 80))
 
 
-def measurement(rho: float, sigma: float, other: float, agreed: int) -> Measurement:
+def measurement(rho: float, sigma: float, told: float, frames: int) -> Measurement:
     """A wall 20 m away, and in PATCH what is given."""
     full = np.full((ROWS, 2 * ROWS), 1 / 20, np.float32)
     found = Measurement(full, np.full_like(full, 0.002), full.copy(),
-                        np.ones(full.shape, np.uint8))
-    for image, value in ((found.rho, rho), (found.sigma, sigma), (found.other, other),
-                         (found.agreed, agreed)):
+                        np.ones(full.shape, np.int8), np.full_like(full, 0.001))
+    for image, value in ((found.rho, rho), (found.sigma, sigma), (found.told, told),
+                         (found.frames, frames)):
         image[PATCH] = value
     return found
 

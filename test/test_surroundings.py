@@ -143,7 +143,7 @@ def test_sky_behind_leaves_is_refused(monkeypatch):
 
     def believed() -> tuple[float, float]:
         found = matcher_.measure(as_frame(current, 480), window)
-        sure = (found.agreed > 0) & (found.sigma < 0.3 * found.rho)
+        sure = (found.frames > 0) & (found.sigma < 0.3 * found.rho)
         return (sure & (found.rho > 0.1))[sky].mean(), sure[near].mean()
     ghosts, known = believed()
     assert known > 0.85

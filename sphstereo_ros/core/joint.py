@@ -19,7 +19,7 @@ from .frames import UNSCALED, Frame, Image8, Reference, RelativePose
 from .guided_sweep import guided_sweep
 from .inverse_range import NOTHING, _grid_angles, _polar_row, pose_sigmas
 from .jit import fast_kernel, kernel, rows_in_parallel
-from .judgement import DEPENDENT, Found, Judged, by_agreement, by_looks
+from .judgement import DEPENDENT, Evidence, Found, Judged, by_agreement, by_looks
 from .matching import UNKNOWN, Matcher, Parallax, stereo_grid
 from .moving import off_meridian
 from .refinement import REACH, JointRefinement, Refined
@@ -46,19 +46,19 @@ _CELL, _SPREADS = 8, (1.0, 6.0)  # px, cells: how what was not matched is filled
 class Measurement:
     """Inverse range on the current frame's grid, float32 (H, 2H), 1/m (1/step if not metric).
 
-    rho, sigma : where `agreed`; sigma is what it would be elsewhere too
+    rho, sigma : where it is believed; sigma is what it would be elsewhere too
     other : the second opinion by itself
-    agreed : uint8, 1 where the second opinion is the same
+    frames : int8, for how many frames of evidence it counts, as `Judged.frames`
+    told : standard deviation by what the grey tells alone, if nothing misleads it
     moving : uint8 (H // 2, 2 * (H // 2)), 255 = leaves its meridian; None if that was not measured
-    told : standard deviation by what the grey tells alone, if nothing misleads it; None as moving
     """
 
     rho: Map
     sigma: Map
     other: Map
-    agreed: Image8
+    frames: Evidence
+    told: Map
     moving: Image8 | None = None
-    told: Map | None = None
 
 
 def in_steps(pose: RelativePose) -> RelativePose:
@@ -116,9 +116,9 @@ def filled(rho: Map) -> Map:
 
 @kernel
 def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map, sin_lon: Map,
-                  axes: Map, at_pole: Map, rho: Map, error: Map, sure: Image8, other: Map,
+                  axes: Map, at_pole: Map, rho: Map, error: Map, frames: Evidence, other: Map,
                   baselines: Map, ways: Map, pose: Map, told: Map, out: Map,
-                  sigma_out: Map, other_out: Map, agreed: Image8,
+                  sigma_out: Map, other_out: Map, frames_out: Evidence,
                   told_out: Map) -> None:  # pragma: no cover - compiled
     """Sample the polar grid; σ of every pixel, with the pose's share.
 
@@ -157,7 +157,7 @@ def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Ma
             sigma_out[i, j] = min(np.sqrt(likely * likely + by_angle * by_angle
                                           + by_pose * by_pose), nothing)
             other_out[i, j] = other[rn, cn]
-            agreed[i, j] = sure[rn, cn]
+            frames_out[i, j] = frames[rn, cn]
             told_out[i, j] = told[rn, cn]
 
 
@@ -253,7 +253,7 @@ class JointMatcher:
                    pairs: Sequence[tuple[Image8, RelativePose]], height: int) -> Measurement:
         rho, sigma, second, told = (np.empty((height, 2 * height), np.float32) for _ in range(4))
         noise = np.float32(DEPENDENT) / np.sqrt(np.maximum(refined.information, 1e-9))
-        sure = np.empty(rho.shape, np.uint8)
+        frames = np.empty(rho.shape, np.int8)
         at_pole = np.array([grid.margin - 0.5, grid.wrap - 0.5, grid.pixel, judged.floor],
                            np.float32)
         poses = np.array([pose_sigmas(p) for _, p in pairs], np.float32)
@@ -262,9 +262,9 @@ class JointMatcher:
         ways = np.array([p.direction for _, p in pairs], np.float32)
         rows_in_parallel(_measure_rows, height, *_grid_angles(height),
                          np.ascontiguousarray(axes, np.float32), at_pole, refined.rho,
-                         judged.error, judged.sure, judged.other, baselines, ways, poses, noise,
-                         rho, sigma, second, sure, told)
-        return Measurement(rho, sigma, second, sure, told=told)
+                         judged.error, judged.frames, judged.other, baselines, ways, poses, noise,
+                         rho, sigma, second, frames, told)
+        return Measurement(rho, sigma, second, frames, told)
 
 
 def in_one_light(image: Image8, model: Image8) -> tuple[Image8, Image8]:

@@ -15,11 +15,16 @@ from .surroundings import inputs, judged
 from .sweep import reduction
 from .warp import Map, PolarGrid
 
+Evidence = NDArray[np.int8]
+
 MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
 # Of the unit: a likely error with which something counts as measured; one reference alone is sure
 # of little, so more is left to the frames that follow.
 _SURE, _SURE_ALONE, _SURE_BOTH = 0.8, 1.2, 0.6
-_NEARER, _NEARER_ALONE = 0.53, 0.6  # of the unit: what may be nearer by more is not sure
+_PLAIN = 0.3  # of the unit: with a smaller likely error it counts for two frames
+# Of the unit: what may be nearer by more is not sure, and by still more, what was remembered there
+# is not believed either.
+_NEARER, _NEARER_ALONE, _VEILED = 0.53, 0.6, 0.8
 _TAIL = 1.0  # of what is published
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
@@ -45,14 +50,16 @@ class Found:
 
 @dataclass(frozen=True)
 class Judged:
-    """Second opinion and likely error (1/m) on the polar grid; sure : 1 = counts as measured.
+    """Second opinion and likely error (1/m) on the polar grid.
 
+    frames : for how many frames of evidence it counts; 0 = it is not believed, −1 = nor should
+    be what is remembered there
     floor : px that no match beats, if the error does not tell them
     """
 
     other: Map
     error: Map
-    sure: Image8
+    frames: Evidence
     floor: float = 0.0
 
 
@@ -71,9 +78,11 @@ def by_looks(found: Found, grid: PolarGrid, baselines: Sequence[float]) -> Judge
         sure &= error < np.float32(_SURE) * unit
         error = expected_error(wider, unit, found.refined, _TAIL)
         told, limit, nearer = together(told, wider), _SURE_BOTH, _NEARER
-    sure &= expected_error(told, unit, found.refined) < np.float32(limit) * unit
-    sure &= may_be_near(told, unit, found.refined.rho, min(baselines)) < np.float32(nearer)
-    return Judged(found.other, error, sure.astype(np.uint8))
+    likely = expected_error(told, unit, found.refined) / unit
+    near = may_be_near(told, unit, found.refined.rho, min(baselines))
+    sure &= (likely < np.float32(limit)) & (near < np.float32(nearer))
+    frames = sure.astype(np.int8) + (sure & (likely < np.float32(_PLAIN)))
+    return Judged(found.other, error, np.where(near < np.float32(_VEILED), frames, np.int8(-1)))
 
 
 def together(own: NDArray[np.float32], wider: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -99,4 +108,4 @@ def by_agreement(found: Found, other: Map, grid: PolarGrid, baseline: float,
     information = np.maximum(found.refined.information, np.float32(1e-9))
     error = np.asarray(np.float32(DEPENDENT) / np.sqrt(information), np.float32)
     sure = (np.abs(rho - other) < allowed) & (found.refined.misfit < MISFIT)
-    return Judged(other, error, sure.astype(np.uint8), _FLOOR)
+    return Judged(other, error, sure.astype(np.int8), _FLOOR)

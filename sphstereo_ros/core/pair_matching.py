@@ -15,7 +15,7 @@ from .frames import Frame, Image8, Reference, RelativePose
 from .inverse_range import NOTHING, InverseRange, _grid_angles, inverse_range
 from .jit import kernel, rows_in_parallel
 from .joint import Floats, JointMatcher, in_steps
-from .judgement import Found, Judged, by_agreement
+from .judgement import Evidence, Found, Judged, by_agreement
 from .matching import Matcher, Parallax, stereo_grid
 from .refinement import JointRefinement, Refined
 from .sphere import polar_axes
@@ -54,7 +54,7 @@ def with_cones(pair: InverseRange, motion: InverseRange, direction: Floats) -> I
 
 @kernel
 def _pair_rows(first: int, last: int, matched: Map, matched_sigma: Map, refined: Map,
-               refined_sigma: Map, other: Map, agreed: Image8, limits: Map, alone: bool,
+               refined_sigma: Map, other: Map, frames: Evidence, limits: Map, alone: bool,
                swept: bool, rho: Map, sigma: Map) -> None:  # pragma: no cover - compiled
     """Of the match, its refinement and the second opinion: inverse range, and σ where believed.
 
@@ -74,7 +74,7 @@ def _pair_rows(first: int, last: int, matched: Map, matched_sigma: Map, refined:
             hides = other[i, j]
             hidden = (hides > near and hides > np.float32(_NEARER) * value
                       and hides > value + pixel)
-            sure = agreed[i, j] > 0
+            sure = frames[i, j] > 0
             believed = (sure or (known and not hidden)) if swept else (sure and known)
             rho[i, j] = value
             sigma[i, j] = spread if believed else np.float32(NOTHING)
@@ -108,7 +108,7 @@ class PairMatcher(JointMatcher):
                           np.float32) / np.float32(pose.baseline)
         rho, sigma = np.empty_like(new.rho), np.empty_like(new.rho)
         rows_in_parallel(_pair_rows, height, matched.rho, matched.sigma, new.rho, new.sigma,
-                         new.other, new.agreed, limits, alone, self._sweeps, rho, sigma)
+                         new.other, new.frames, limits, alone, self._sweeps, rho, sigma)
         return InverseRange(rho, sigma, self.signed)
 
     def _refined(self, view: Image8, grid: PolarGrid, axes: Floats,

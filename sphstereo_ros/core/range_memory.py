@@ -2,8 +2,9 @@
 
 The range of the frame before, moved by the relative pose, is compared with the new measurement.
 Where they agree they are averaged and evidence grows; where nothing confirms it, evidence fades,
-and what is contradicted goes at once or within a few frames. A pixel is published when enough
-frames bear it out.
+and what is contradicted goes at once or within a few frames. What is measured there but not
+believed contradicts, too, if it is something else: a thing that came before what is remembered
+looks like that. A pixel is published when enough frames bear it out.
 """
 from __future__ import annotations
 
@@ -12,17 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .frames import FrameKey, Image8, Reference, RelativePose
+from .frames import FrameKey, Reference, RelativePose
 from .history import PoseHistory
 from .inverse_range import NOTHING, _grid_angles
 from .jit import fast_kernel, kernel, rows_in_parallel
 from .joint import Measurement, in_steps
+from .judgement import Evidence
 from .warp import Map, _arctan2
 
 _MOST = 6.0  # evidence
-_CONTRADICTED, _UNCONFIRMED, _UNSUPPORTED = 2.0, 1.0, 0.3  # what a frame takes away of it
+_CONTRADICTED, _UNCONFIRMED, _UNTOLD = 2.0, 1.0, 0.3  # what a frame takes away of it
+_DOUBTED = 3.0  # evidence is no more than that where the newest frame is not believed
 _AGREES, _SAME = 3.0, 0.02  # standard deviations, or share of the inverse range
-_OTHER, _CONFIRMS = 0.05, 0.3  # shares of it
+_CONFIRMS, _AGAIN, _BLIND = 0.3, 0.05, 0.05  # shares of it
 _GROWTH = 1.25  # of sigma from frame to frame: errors of consecutive frames are much alike
 _PUBLISHED = 2.0  # evidence that is enough
 
@@ -91,39 +94,50 @@ def _splat(old_rho: Map, old_sigma: Map, old_evidence: Map, at_column: Map, at_r
 
 
 @kernel
-def _update_rows(first: int, last: int, new_rho: Map, new_sigma: Map, other: Map, agreed: Image8,
+def _doubted(level: float, found_again: bool, blind: bool,
+             fade: float) -> np.float32:  # pragma: no cover - compiled
+    """Evidence that is left where a frame is not believed.
+
+    found_again : it measures the same nevertheless; blind : its grey tells nothing, so it
+    contradicts nothing either
+    """
+    if blind:
+        return np.float32(level - max(_UNTOLD, fade))
+    loss = _UNCONFIRMED if found_again else _CONTRADICTED
+    return np.float32(min(level, _DOUBTED) - max(loss, fade))
+
+
+@kernel
+def _update_rows(first: int, last: int, new_rho: Map, new_sigma: Map, told: Map, frames: Evidence,
                  fade: float, rho: Map, sigma: Map,
                  evidence: Map) -> None:  # pragma: no cover - compiled
     """The moved memory (rho, sigma, evidence) becomes the new one, pixel by pixel."""
     for i in range(first, last):
         for j in range(rho.shape[1]):
             measured, spread = new_rho[i, j], new_sigma[i, j]
-            sure = agreed[i, j] != 0 and spread < NOTHING
+            counts = np.float32(max(frames[i, j], 0)) if spread < NOTHING else np.float32(0)
             if sigma[i, j] >= NOTHING:
-                rho[i, j] = measured if sure else np.float32(0)
-                sigma[i, j] = spread if sure else np.float32(NOTHING)
-                evidence[i, j] = np.float32(1) if sure else np.float32(0)
+                rho[i, j] = measured if counts > 0 else np.float32(0)
+                sigma[i, j] = spread if counts > 0 else np.float32(NOTHING)
+                evidence[i, j] = counts
                 continue
-            old, s = rho[i, j], sigma[i, j] * np.float32(_GROWTH)
-            allowed = max(_AGREES * np.sqrt(s * s + spread * spread), _SAME * old)
-            same = abs(measured - old) < allowed
-            before = s
-            level = evidence[i, j]
+            old, before = rho[i, j], sigma[i, j] * np.float32(_GROWTH)
+            level, s, off = evidence[i, j], before, abs(measured - old)
+            same = off < max(_AGREES * np.sqrt(s * s + spread * spread), _SAME * old)
             if same:
                 w, w_new = 1 / (s * s), 1 / (spread * spread)
                 rho[i, j] = (w * old + w_new * measured) / (w + w_new)
                 s = np.float32(1) / np.sqrt(w + w_new)
-                # What could be anything contradicts nothing, but confirms nothing either.
-                told = sure and abs(measured - old) < max(np.float32(_CONFIRMS) * old,
-                                                          np.float32(3) * before)
-                level += np.float32(1) if told else -np.float32(max(_UNSUPPORTED, fade))
-            elif sure:
+            # What could be anything confirms nothing.
+            if same and counts > 0 and off < max(np.float32(_CONFIRMS) * old, 3 * before):
+                level += counts
+            elif counts > 0 and not same:
                 level -= np.float32(_CONTRADICTED)
                 if level <= 0 or measured > old:  # what is nearer counts at once
-                    rho[i, j], s, level = measured, spread, np.float32(1)
+                    rho[i, j], s, level = measured, spread, counts
             else:
-                supported = abs(other[i, j] - old) < max(_OTHER * old, 3 * s)
-                level -= np.float32(max(_UNSUPPORTED if supported else _UNCONFIRMED, fade))
+                level = _doubted(level, off < max(np.float32(_AGAIN) * old, before),
+                                 told[i, j] > np.float32(_BLIND) * old, fade)
             evidence[i, j] = min(level, np.float32(_MOST))
             sigma[i, j] = s if level > 0 else np.float32(NOTHING)
 
@@ -149,14 +163,14 @@ class RangeMemory:
         The result has only what enough frames bear out.
         """
         metric = all(r.pose.is_metric for r in references)
-        agreed = new.agreed if vehicle is None else np.where(vehicle, np.uint8(0), new.agreed)
+        frames = new.frames if vehicle is None else np.where(vehicle, np.int8(0), new.frames)
         moved = self._moved(key, references, metric, new.rho.shape)
         fade = self._fade(key)
-        rows_in_parallel(_update_rows, len(new.rho), new.rho, new.sigma, new.other, agreed, fade,
+        rows_in_parallel(_update_rows, len(new.rho), new.rho, new.sigma, new.told, frames, fade,
                          moved.rho, moved.sigma, moved.evidence)
         self._key, self._kept, self._metric = key, moved, metric
         self._frames += 1
-        enough = moved.evidence >= min(self._frames, _PUBLISHED)
+        enough = (moved.evidence >= min(self._frames, _PUBLISHED)) & (frames >= 0)
         return Remembered(moved.rho, np.where(enough, moved.sigma, np.float32(NOTHING)),
                           moved.evidence)
 

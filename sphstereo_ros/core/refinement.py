@@ -58,10 +58,14 @@ def _differences(first: int, last: int, current: Image8, mean: Map, view: Image8
         for j in range(columns):
             left, right = max(j - 1, 0), min(j + 1, columns - 1)
             s, c = sin_theta[j], cos_theta[j]
-            gx = quarter * (gain * (np.float32(view[i, right]) - np.float32(view[i, left]))
-                            + np.float32(current[i, right]) - np.float32(current[i, left]))
-            gy = quarter * (gain * (np.float32(view[below, j]) - np.float32(view[above, j]))
-                            + np.float32(current[below, j]) - np.float32(current[above, j]))
+            gx = quarter * (gain * (np.float32(view[i, right]) - np.float32(view[i, left])
+                                    - view_mean[i, right] + view_mean[i, left])
+                            + np.float32(current[i, right]) - np.float32(current[i, left])
+                            - mean[i, right] + mean[i, left])
+            gy = quarter * (gain * (np.float32(view[below, j]) - np.float32(view[above, j])
+                                    - view_mean[below, j] + view_mean[above, j])
+                            + np.float32(current[below, j]) - np.float32(current[above, j])
+                            - mean[below, j] + mean[above, j])
             along = radial * c - position[2] * s
             depth = radial * s + position[2] * c
             slope[i, j] = -(gx * along + gy * across / max(abs(s), np.float32(0.02))) / max(
