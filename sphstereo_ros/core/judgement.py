@@ -24,8 +24,8 @@ _SURE, _SURE_ALONE, _SURE_BOTH = 0.8, 1.2, 0.6
 _PLAIN = 0.3  # of the unit: with a smaller likely error it counts for two frames
 # Of the unit: what may be nearer by more is not sure, and by still more, what was remembered there
 # is not believed either.
-_NEARER, _NEARER_ALONE, _VEILED = 0.53, 0.6, 0.8
-_TAIL = 1.0  # of what is published
+_NEARER, _VEILED = 0.6, 1.2
+_TAIL = 0.75  # of what is published
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
 _AGREES, _LEVELS, _SLACK = 0.05, 0.75, 1.5
@@ -72,15 +72,15 @@ def by_looks(found: Found, grid: PolarGrid, baselines: Sequence[float]) -> Judge
     told, unit = percentiles(seen, grid, baselines, network())
     error = expected_error(told, unit, found.refined)
     sure = found.refined.misfit < MISFIT
-    limit, nearer = _SURE_ALONE, _NEARER_ALONE
+    limit = _SURE_ALONE
     if len(baselines) > 1:
         wider = judged(inputs(found.view, seen, told, unit, grid, baselines), grid.shape)
         sure &= error < np.float32(_SURE) * unit
         error = expected_error(wider, unit, found.refined, _TAIL)
-        told, limit, nearer = together(told, wider), _SURE_BOTH, _NEARER
+        told, limit = together(told, wider), _SURE_BOTH
     likely = expected_error(told, unit, found.refined) / unit
     near = may_be_near(told, unit, found.refined.rho, min(baselines))
-    sure &= (likely < np.float32(limit)) & (near < np.float32(nearer))
+    sure &= (likely < np.float32(limit)) & (near < np.float32(_NEARER))
     frames = sure.astype(np.int8) + (sure & (likely < np.float32(_PLAIN)))
     return Judged(found.other, error, np.where(near < np.float32(_VEILED), frames, np.int8(-1)))
 
