@@ -36,6 +36,7 @@ from .voxels import Map32, VoxelMap, VoxelPoints
 
 _ROWS = 220  # of a range image that take part, about; each in as many columns as make it even
 _LEAST_SIGMA = 0.003  # m: no range is better, whatever it tells
+_ALIKE = 1.5  # times sigma: errors of consecutive frames are alike, and their tails are long
 
 
 @dataclass(frozen=True)
@@ -236,7 +237,8 @@ class Mapper:
                          np.array([farthest, limits.max_relative_sigma, least], np.float32),
                          xyz, spread, bgr)
         self._count += 1
-        return _Scan(image.key, xyz[:count].copy(), spread[:count].copy(), bgr[:count].copy())
+        return _Scan(image.key, xyz[:count].copy(), np.float32(_ALIKE) * spread[:count],
+                     bgr[:count].copy())
 
     def _fuse(self, scan: _Scan) -> None:
         placed = self.track[scan.key]
