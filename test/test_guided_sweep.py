@@ -129,6 +129,16 @@ def test_levels_get_coarser_before_the_nearest_are_left_out(baselines, height, n
     assert found[-1] >= min(nearest, 1 / 0.3, 2 / min(baselines))
 
 
+def test_what_is_near_is_found_where_it_is_known_to_be_far():
+    world = Posts(cell=0.25, posts=((0.8, 0.0, 0.2), (-0.8, 0.1, 0.2)))
+    view = polar_view(world, ((0, 0, -0.3), (0, 0, -0.6)))
+    truth = view.rho(half(view))
+    near = clear(view, half(view)) & (truth > 0.8)
+    found = swept(view, np.full_like(view.rho(), 0.2))
+    assert near.mean() > 0.02
+    assert wrong(found, truth)[near].mean() < 0.25
+
+
 def test_what_is_nearer_than_all_levels_stays_where_it_is_known_to_be(posts):
     view, known = posts, posts.rho().copy()
     known[40:44] = 2.0  # two pixels wide at half size: too narrow to ask for levels

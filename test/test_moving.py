@@ -203,7 +203,7 @@ def test_a_speck_under_the_floor_is_wrong_but_does_not_move():
     known = Remembered(rho.copy(), sigma.copy(), np.ones_like(rho))
     known.rho[140, 100] = 1 / 100
     known.sigma[140, 100] = 1e-3
-    new = Measurement(rho, sigma, rho.copy(), np.ones(rho.shape, np.uint8))
+    new = Measurement(rho, sigma, rho.copy(), np.ones(rho.shape, np.int8), sigma)
     wrong, moving = moving_parts(known, new, DOWN)
     assert np.argwhere(wrong).tolist() == [[140, 100]]
     assert not moving.any()

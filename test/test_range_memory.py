@@ -218,6 +218,39 @@ def test_what_is_nearer_counts_at_once():
     np.testing.assert_allclose(found.rho, NEAR, rtol=0.01)
 
 
+def test_a_thing_that_is_seen_but_not_believed_takes_away_what_was_far():
+    """Its own inverse range says what its grey tells, not that of what is behind."""
+    camera = practised(rho=FAR)
+    seen = measurement(1.0, frames=0, told=0.01)
+    levels = [float(np.median(camera.sees(seen).evidence)) for _ in range(2)]
+    np.testing.assert_allclose(np.maximum(levels, 0), [1, 0])
+
+
+def test_what_is_not_believed_moves_nothing():
+    camera = practised(rho=0.3)
+    before = camera.sees(measurement(0.3))
+    found = camera.sees(measurement(0.2, frames=0, sigma=0.5, told=1.0))
+    np.testing.assert_allclose(found.rho, 0.3, rtol=5e-3)
+    assert (found.sigma >= before.sigma).all()
+
+
+def test_what_is_farther_waits_for_a_second_frame_however_plain():
+    camera = practised(2)
+    assert not known(camera.sees(measurement(FAR, frames=2))).any()
+    assert known(camera.sees(measurement(FAR, frames=2))).all()
+
+
+@settings(deadline=None)
+@given(st.floats(0.03, 0.44), st.sampled_from([1, 2]))
+def test_what_is_contradicted_is_not_kept_longer_than_the_memory(period, frames):
+    camera = practised()
+    time = 0.0
+    while time < SECONDS:
+        found = camera.sees(measurement(FAR, frames), after=round(period * 1e9))
+        time += period
+    assert not (known(found) & (found.rho > 2 * FAR)).any()
+
+
 def test_what_is_farther_has_to_insist():
     camera = practised(rho=NEAR)
     for n in range(1, 6):

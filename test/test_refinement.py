@@ -9,6 +9,7 @@ import pytest
 from analytic_world import Ball, World
 from polar_views import HEIGHT, PolarView, Vector, polar_view
 
+from sphstereo_ros.core.camera import Equirectangular
 from sphstereo_ros.core.refinement import NEAR_BY, JointRefinement, Refined
 from sphstereo_ros.core.sphere import polar_bearings
 
@@ -167,6 +168,21 @@ def test_information_adds_up_and_falls_with_contrast():
         view.current, view.world)
     less = refined(faint, view.rho()).information
     assert np.median(less[clear]) < 0.2 * np.median(both[clear])
+
+
+def test_light_that_changes_slowly_tells_nothing():
+    """Vignetting, or the glare of the sun on a road: it goes with the camera."""
+    view = seen()
+
+    def lit(image: np.ndarray, bearings: np.ndarray) -> np.ndarray:
+        return np.asarray(np.clip(0.06 * image + 120 + 110 * bearings[..., 2], 0, 255), np.uint8)
+    image = view.pairs[0][0]
+    sphere = Equirectangular(*image.shape).bearings()
+    ahead = polar_bearings(view.grid.theta()[None], view.grid.azimuth()[:, None], view.axes)
+    glare = PolarView(lit(view.image, ahead), view.grid, view.axes,
+                      [(lit(i, sphere), p) for i, p in view.pairs], view.current, view.world)
+    off = errors(refined(glare, off_by(view, 0.05)), view)
+    assert np.median(np.abs(off)) < 0.02
 
 
 def test_misfit_tells_what_does_not_fit():

@@ -7,6 +7,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from sphstereo_ros.bench.reliability import HIDDEN, Fit, Samples, fit
+from sphstereo_ros.core import judgement
+from sphstereo_ros.core.judgement import Found, by_looks
 from sphstereo_ros.core.matching import UNKNOWN, Parallax, stereo_grid
 from sphstereo_ros.core.refinement import Refined
 from sphstereo_ros.core.reliability import (
@@ -151,3 +153,24 @@ def test_a_saved_fit_is_read_as_it_was(tmp_path):
     net = Network(*(tuple(data[f'{name}{n}'] for n in range(3)) for name in ('weight', 'bias')))
     assert [w.shape[1] for w in net.weights] == [*HIDDEN, 3]
     np.testing.assert_allclose(outputs(looks, net), fitted.layers(looks)[-1], atol=1e-3)
+
+
+@pytest.mark.parametrize(('likely', 'nearer', 'own', 'misfit', 'frames'), [
+    (0.1, 0.1, 0.1, 1, 2), (0.5, 0.1, 0.1, 1, 1), (0.9, 0.1, 0.1, 1, 0), (0.1, 0.1, 1.0, 1, 0),
+    (0.1, 0.1, 0.1, 200, 0), (0.1, 0.9, 0.1, 1, 0), (0.1, 1.5, 0.1, 1, -1)])
+def test_what_is_told_decides_for_how_much_it_counts(monkeypatch, likely, nearer, own, misfit,
+                                                     frames):
+    """Likely errors and what may be nearer, in units; of pixels and of what is round about."""
+    shape = GRID.shape
+    rho = np.full(shape, 0.5, np.float32)
+
+    def told(error: float) -> np.ndarray:
+        logarithms = np.log([error + LEAST, error + LEAST, nearer])
+        return np.broadcast_to(logarithms[:, None, None], (3, *shape)).astype(np.float32)
+    view, _, _, matched, parallax = found(np.random.default_rng(0))
+    refined = Refined(rho, np.full(shape, 1e9, np.float32), np.full(shape, misfit, np.float32))
+    monkeypatch.setattr(judgement, 'percentiles', lambda *_: (told(own), rho))
+    monkeypatch.setattr(judgement, 'judged', lambda *_: told(likely))
+    judged = by_looks(Found(view, refined, rho, matched, parallax), GRID, BASELINES)
+    assert (judged.frames == frames).all()
+    np.testing.assert_allclose(judged.error, likely * rho, rtol=1e-2)

@@ -51,7 +51,7 @@ _STEEP = 3  # levels a pixel that a plane falls at most
 _WORST = np.uint16(255)
 # Levels go as near as what is known to be nearest (px across), and beyond; and at least to so much
 # of the nearest baseline over range.
-_SPOT, _BEYOND, _AT_LEAST = 3, 1.25, 0.25
+_SPOT, _BEYOND, _AT_LEAST = 3, 1.25, 0.5
 # Penalties for a change by more than a level: less, from _JUMP to _EDGE, where grey changes.
 _JUMP, _EDGE = 300, 80
 

@@ -4,7 +4,7 @@
 
 The nearest pair decides what is near: its parallaxes are small, so nothing is missed by a search
 that ends. The farther references then sharpen what it found. The second opinion, a sweep over the
-sphere, errs in other places than a dense flow does; only what both find is measured.
+sphere, errs in other places than a dense flow does; how both look decides what is believed.
 """
 from __future__ import annotations
 

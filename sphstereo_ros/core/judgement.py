@@ -18,9 +18,10 @@ from .warp import Map, PolarGrid
 Evidence = NDArray[np.int8]
 
 MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
-# Of the unit: a likely error with which something counts as measured; one reference alone is sure
-# of little, so more is left to the frames that follow.
-_SURE, _SURE_ALONE, _SURE_BOTH = 0.8, 1.2, 0.6
+# Of the unit: a likely error with which something counts as measured, by what pixels tell
+# themselves, and together with what is round about. One reference alone is sure of little, so
+# more is left to the frames that follow.
+_SURE, _SURE_BOTH, _SURE_ALONE = 0.8, 0.6, 1.2
 _PLAIN = 0.3  # of the unit: with a smaller likely error it counts for two frames
 # Of the unit: what may be nearer by more is not sure, and by still more, what was remembered there
 # is not believed either.

@@ -218,8 +218,8 @@ def moving_parts(known: Remembered, measured: Measurement,
     if plane is not None:
         wrong |= under_floor(known.rho, known.sigma, plane) != 0
         # What keeps pace looks like nothing that was fitted to: both opinions, not its sigma.
-        told = measured.sigma if measured.told is None else measured.told
-        under = under_floor(measured.rho, told, plane) & under_floor(measured.other, told, plane)
+        under = (under_floor(measured.rho, measured.told, plane)
+                 & under_floor(measured.other, measured.told, plane))
         signs = signs | cv2.resize(under, half, interpolation=cv2.INTER_NEAREST)
     moving = cv2.resize(cleaned(signs), (width, height), interpolation=cv2.INTER_NEAREST)
     return wrong | (moving != 0), np.asarray(moving, np.uint8)

@@ -124,7 +124,8 @@ def _update_rows(first: int, last: int, new_rho: Map, new_sigma: Map, told: Map,
             old, before = rho[i, j], sigma[i, j] * np.float32(_GROWTH)
             level, s, off = evidence[i, j], before, abs(measured - old)
             same = off < max(_AGREES * np.sqrt(s * s + spread * spread), _SAME * old)
-            if same:
+            again = off < max(np.float32(_AGAIN) * old, before)
+            if same and (counts > 0 or again):
                 w, w_new = 1 / (s * s), 1 / (spread * spread)
                 rho[i, j] = (w * old + w_new * measured) / (w + w_new)
                 s = np.float32(1) / np.sqrt(w + w_new)
@@ -132,12 +133,14 @@ def _update_rows(first: int, last: int, new_rho: Map, new_sigma: Map, told: Map,
             if same and counts > 0 and off < max(np.float32(_CONFIRMS) * old, 3 * before):
                 level += counts
             elif counts > 0 and not same:
-                level -= np.float32(_CONTRADICTED)
-                if level <= 0 or measured > old:  # what is nearer counts at once
+                level -= np.float32(max(_CONTRADICTED, fade))
+                if measured > old:  # what is nearer counts at once
                     rho[i, j], s, level = measured, spread, counts
+                elif level <= 0:  # what is farther has to wait, however plain it looks
+                    rho[i, j], s, level = measured, spread, np.float32(1)
             else:
-                level = _doubted(level, off < max(np.float32(_AGAIN) * old, before),
-                                 told[i, j] > np.float32(_BLIND) * old, fade)
+                blind = told[i, j] > np.float32(_BLIND) * max(old, measured)
+                level = _doubted(level, again, blind, fade)
             evidence[i, j] = min(level, np.float32(_MOST))
             sigma[i, j] = s if level > 0 else np.float32(NOTHING)
 
