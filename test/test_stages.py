@@ -190,6 +190,19 @@ def test_rotation_and_direction_are_recovered(motion, turn):
     assert pose.baseline == pytest.approx(0.28, rel=1e-9)
 
 
+@pytest.mark.parametrize('gain', [0.45, 0.7, 1.3])
+def test_alignment_does_not_mind_another_exposure(gain):
+    """Halved from one frame to the next, as where a camera comes out of the shade."""
+    current, reference = seen(), before('forward', (0.02, -0.01, 0.01))
+    dark = with_image(reference, np.clip(gain * reference.image, 0, 255))
+    start = exact(reference, current)
+    same, other = (aligned(current, r, start) for r in (reference, dark))
+    rotation, direction = errors(other, reference, current)
+    assert rotation < 0.05
+    assert direction < 0.3
+    assert angle_between(same.position, other.position) < np.radians(0.2)
+
+
 def test_covariance_is_honest_about_the_pose():
     """Errors of the aligned pose against its covariance: neither far outside nor far inside."""
     squared = []

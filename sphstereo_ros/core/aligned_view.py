@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .frames import Image8, RelativePose
+from .photometric import like
 from .relative_pose import Correspondences
 from .relief import nearness_map, reference_in_relief, sampled
 from .sphere import polar_axes, polar_bearings
@@ -89,7 +90,7 @@ def followed(view: CurrentView, reference: Image8, pose: RelativePose,
     if not view.knows_ranges:
         image = resample(with_border(reference), polar_map(
             view.grid, pose.rotation.T @ view.axes, reference.shape))
-        moved, found = follow_both_ways(view.image, image, view.points)
+        moved, found = follow_both_ways(view.image, like(image, view.image), view.points)
         chosen = np.nonzero(found)[0]
         seen = view.bearings_of(moved[found])
     else:
@@ -97,7 +98,8 @@ def followed(view: CurrentView, reference: Image8, pose: RelativePose,
         image = reference_in_relief(reference, pose, view.grid, view.axes, relief)
         chosen = np.nonzero(_alike(_seen(view.bearings, relief, view.points, pose),
                                    view.bearings))[0]
-        moved, found = follow_both_ways(view.image, image, view.points[chosen], levels=_LEVELS)
+        moved, found = follow_both_ways(view.image, like(image, view.image),
+                                        view.points[chosen], levels=_LEVELS)
         moved, chosen = moved[found], chosen[found]
         seen = _seen(view.bearings_of(moved), relief, moved, pose)
         seen /= np.linalg.norm(seen, axis=1, keepdims=True)

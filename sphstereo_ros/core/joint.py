@@ -22,6 +22,7 @@ from .jit import fast_kernel, kernel, rows_in_parallel
 from .judgement import DEPENDENT, Evidence, Found, Judged, by_agreement, by_looks
 from .matching import UNKNOWN, Matcher, Parallax, stereo_grid
 from .moving import off_meridian
+from .photometric import like
 from .refinement import REACH, JointRefinement, Refined
 from .sphere import polar_axes
 from .sweep import sweep
@@ -275,7 +276,7 @@ def in_one_light(image: Image8, model: Image8) -> tuple[Image8, Image8]:
     both lose what changes slowly: to make one as bright as the other round about would print the
     other's shades on what is blank.
     """
-    alike = _like(image, model)
+    alike = like(image, model)
     reach = _LIGHT * min(image.shape) / _CELL
     size = (image.shape[1] // _CELL, image.shape[0] // _CELL)
     slow = [cv2.GaussianBlur(cv2.resize(i, size, interpolation=cv2.INTER_AREA), (0, 0), reach)
@@ -286,14 +287,3 @@ def in_one_light(image: Image8, model: Image8) -> tuple[Image8, Image8]:
     quick = [cv2.addWeighted(i, 1.0, cv2.resize(s, i.shape[::-1]), -1.0, 128.0)
              for i, s in zip((alike, model), slow, strict=True)]
     return np.asarray(quick[0], np.uint8), np.asarray(quick[1], np.uint8)
-
-
-def _like(image: Image8, model: Image8) -> Image8:
-    (mean, spread), (wanted, wanted_spread) = (
-        (float(m[0, 0]), float(s[0, 0])) for m, s in
-        (cv2.meanStdDev(i[::4, ::4]) for i in (image, model)))
-    gain = min(max(wanted_spread / max(spread, 1e-3), 0.3), 3.0)
-    if abs(np.log(gain)) < 0.05 and abs(mean - wanted) < 3:
-        return image
-    table = np.clip(gain * (np.arange(256) - mean) + wanted, 0, 255).round().astype(np.uint8)
-    return np.asarray(cv2.LUT(image, table), np.uint8)

@@ -22,6 +22,21 @@ def matched(image: Image8, like: Image8) -> Image8:
     return np.asarray(np.rint(curve).astype(np.uint8)[image])
 
 
+def like(image: Image8, model: Image8) -> Image8:
+    """`image` with the contrast and brightness of `model`, where they differ by much.
+
+    Both show nearly the same, pixel by pixel: (H, W) uint8.
+    """
+    (mean, spread), (wanted, wanted_spread) = (
+        (float(m[0, 0]), float(s[0, 0])) for m, s in
+        (cv2.meanStdDev(i[::4, ::4]) for i in (image, model)))
+    gain = min(max(wanted_spread / max(spread, 1e-3), 0.3), 3.0)
+    if abs(np.log(gain)) < 0.05 and abs(mean - wanted) < 3:
+        return image
+    table = np.clip(gain * (np.arange(256) - mean) + wanted, 0, 255).round().astype(np.uint8)
+    return np.asarray(cv2.LUT(image, table), np.uint8)
+
+
 def normalised(image: Image8, contrast: float = 20.0, floor: float = 12.0,
                radius: float = 8.0) -> Image8:
     """The image (H, 2H) with the same mean and nearly the same contrast everywhere.
