@@ -20,8 +20,9 @@ from sphstereo_ros.core.frames import (
     Reference,
     RelativePose,
 )
-from sphstereo_ros.core.joint import JointMatcher, Measurement, filled, in_one_light, in_steps
+from sphstereo_ros.core.joint import JointMatcher, Measurement, filled, in_steps
 from sphstereo_ros.core.matching import UNKNOWN, matcher, stereo_grid
+from sphstereo_ros.core.photometric import in_one_light
 from sphstereo_ros.core.stereo import SphericalStereo
 
 ROOM = World()

@@ -9,7 +9,7 @@ from analytic_world import View, World, look, true_pose
 
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import AlignedWindow, Frame, FrameKey, RangeImage, Reference
-from sphstereo_ros.core.joint import in_one_light
+from sphstereo_ros.core.photometric import in_one_light
 from sphstereo_ros.core.stereo import SphericalStereo
 
 HEIGHT = 280

@@ -4,7 +4,8 @@
     python -m sphstereo_ros.bench.surroundings fit OUT.onnx FOLDER...
 
 `render` makes scenes for it alone: of seeds that are neither tuned on nor reported, four frames
-each. `fit` needs torch and onnx (extra `fit`); the package itself does without.
+each, or one pair of two cameras. `fit` needs torch and onnx (extra `fit`); the package itself does
+without.
 """
 from __future__ import annotations
 
@@ -24,6 +25,7 @@ from sphstereo_ros.core.judgement import Found
 from sphstereo_ros.core.reliability import LEAST, Look, network, percentiles
 from sphstereo_ros.core.surroundings import BLOCK, CHANNELS, inputs, interior
 from sphstereo_ros.core.warp import PolarGrid
+from sphstereo_ros.scenes.binocular import TopCamera, render_binocular, save_binocular
 from sphstereo_ros.scenes.sequence import (
     TruthFrame,
     load_sequence,
@@ -39,11 +41,13 @@ Floats = NDArray[np.floating]
 Parameters = dict[str, Any]  # name of a layer → weight and bias
 Node = TypeVar('Node')
 
-_SEEDS = range(11, 61)
+_SEEDS, _PAIR_SEEDS = range(11, 61), range(61, 81)
 _RENDERED = (1, 7, 10, 11)  # frames of a sequence
 # Windows by how many frames a sequence has: current frame, and the references' places.
-_WINDOWS = {4: ((3, (2, 1, 0)), (3, (2, 1))), 12: ((11, (10, 7, 1)), (8, (7, 4))),
-            14: ((11, (10, 7, 1)), (8, (7, 4)))}
+_WINDOWS = {2: ((0, (1,)),), 4: ((3, (2, 1, 0)), (3, (2, 1)), (3, (2,))),
+            12: ((11, (10, 7, 1)), (8, (7, 4)), (5, (4,))),
+            14: ((11, (10, 7, 1)), (8, (7, 4)), (5, (4,)))}
+_TURNED = 4.0  # degrees about each axis at most, of a pair's top camera
 # Weights of what is 10 to 100 m away, and of what is near but was found far.
 _RARE, _TOO_FAR = 2.0, 2.0
 _WIDTHS = (16, 32, 48, 64, 64, 64)  # channels at half size, a quarter, …
@@ -131,6 +135,23 @@ def render(folder: Path) -> None:
         sequence = render_sequence(name, seed, 14, height, spacing=step, nuisance=nuisance)
         frames: list[TruthFrame] = [sequence[k] for k in _RENDERED]
         save_sequence(frames, target.with_suffix('.part'), name)
+        target.with_suffix('.part').rename(target)
+    _render_pairs(folder)
+
+
+def _render_pairs(folder: Path) -> None:
+    for seed in tqdm(_PAIR_SEEDS, unit='pair'):
+        name = ('street', 'takeoff', 'street', 'corridor')[seed % 4]
+        target = folder / f'pair_{name}_{seed}'
+        if target.exists():
+            continue
+        rng = np.random.default_rng(seed)
+        roll, pitch, yaw = np.radians(rng.uniform(-_TURNED, _TURNED, 3)).tolist()
+        rig = TopCamera((roll, pitch, yaw), float(rng.uniform(0.2, 0.5)),
+                        gain=float(rng.uniform(0.8, 1.2)))
+        height = 960 if name != 'corridor' and seed % 3 else 480
+        sequence = render_binocular(name, seed, 1, height, rig)
+        save_binocular(sequence, target.with_suffix('.part'), name)
         target.with_suffix('.part').rename(target)
 
 

@@ -22,7 +22,7 @@ from .jit import fast_kernel, kernel, rows_in_parallel
 from .judgement import DEPENDENT, Evidence, Found, Judged, by_agreement, by_looks
 from .matching import UNKNOWN, Matcher, Parallax, stereo_grid
 from .moving import off_meridian
-from .photometric import like
+from .photometric import in_one_light
 from .refinement import REACH, JointRefinement, Refined
 from .sphere import polar_axes
 from .sweep import sweep
@@ -38,8 +38,6 @@ _WINDOWS = {'joint': (9, 9), 'joint_fast': (9,)}
 # _TALL rows: less where there are fewer, for it must not see across what is there.
 _LAST, _LAST_LEVEL = 9, (9, 15)
 _ALONE, _ALONE_LEVEL, _TALL = 21, (15, 25), 960
-# Light: how far round about, of half a turn; grey levels; percentile that differs by a share.
-_LIGHT, _DARK, _MOSTLY, _ALIKE = 1 / 30, 8.0, 90, 0.08
 _CELL, _SPREADS = 8, (1.0, 6.0)  # px, cells: how what was not matched is filled for a start
 
 
@@ -266,24 +264,3 @@ class JointMatcher:
                          judged.error, judged.frames, judged.other, baselines, ways, poses, noise,
                          rho, sigma, second, frames, told)
         return Measurement(rho, sigma, second, frames, told)
-
-
-def in_one_light(image: Image8, model: Image8) -> tuple[Image8, Image8]:
-    """Both images as if taken in the same light; of (H, W) uint8, nearly aligned.
-
-    The image gets the contrast and brightness of `model`, where they differ by much. Where the
-    light differs from place to place (a rolling shutter under lamps that flicker, two lenses),
-    both lose what changes slowly: to make one as bright as the other round about would print the
-    other's shades on what is blank.
-    """
-    alike = like(image, model)
-    reach = _LIGHT * min(image.shape) / _CELL
-    size = (image.shape[1] // _CELL, image.shape[0] // _CELL)
-    slow = [cv2.GaussianBlur(cv2.resize(i, size, interpolation=cv2.INTER_AREA), (0, 0), reach)
-            for i in (alike, model)]
-    there, here = (s.astype(np.float32) + _DARK for s in slow)
-    if float(np.percentile(np.abs(np.log(there / here)), _MOSTLY)) < _ALIKE:
-        return alike, model
-    quick = [cv2.addWeighted(i, 1.0, cv2.resize(s, i.shape[::-1]), -1.0, 128.0)
-             for i, s in zip((alike, model), slow, strict=True)]
-    return np.asarray(quick[0], np.uint8), np.asarray(quick[1], np.uint8)

@@ -65,20 +65,15 @@ class Judged:
 
 
 def by_looks(found: Found, grid: PolarGrid, baselines: Sequence[float]) -> Judged:
-    """What looks as here errs so much as a rule; baselines of the references in m.
-
-    One reference alone is judged pixel by pixel: what is round about was not fitted to it.
-    """
+    """What looks as here errs so much as a rule; baselines of the references in m."""
     seen = look(found.view, found.refined, found.other, found.matched, found.parallax)
-    told, unit = percentiles(seen, grid, baselines, network())
-    error = expected_error(told, unit, found.refined)
+    own, unit = percentiles(seen, grid, baselines, network())
+    wider = judged(inputs(found.view, seen, own, unit, grid, baselines), grid.shape)
+    error = expected_error(wider, unit, found.refined, _TAIL)
     sure = found.refined.misfit < MISFIT
-    limit = _SURE_ALONE
-    if len(baselines) > 1:
-        wider = judged(inputs(found.view, seen, told, unit, grid, baselines), grid.shape)
-        sure &= error < np.float32(_SURE) * unit
-        error = expected_error(wider, unit, found.refined, _TAIL)
-        told, limit = together(told, wider), _SURE_BOTH
+    sure &= expected_error(own, unit, found.refined) < np.float32(_SURE) * unit
+    told = together(own, wider)
+    limit = _SURE_BOTH if len(baselines) > 1 else _SURE_ALONE
     likely = expected_error(told, unit, found.refined) / unit
     near = may_be_near(told, unit, found.refined.rho, min(baselines))
     sure &= (likely < np.float32(limit)) & (near < np.float32(_NEARER))

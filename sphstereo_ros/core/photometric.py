@@ -1,4 +1,4 @@
-"""Two cameras see the same world in different brightness: one is made to look like the other."""
+"""Two views of the same world in different light: one is made to look like the other."""
 from __future__ import annotations
 
 import cv2
@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 from .frames import Image8
 
 _LEVELS = 256
+# Light that differs: how far round about, of half a turn, on cells of so many pixels; grey levels;
+# percentile that differs by a share.
+_LIGHT, _CELL, _DARK, _MOSTLY, _SAME = 1 / 30, 8, 8.0, 90, 0.08
 
 
 def matched(image: Image8, like: Image8) -> Image8:
@@ -35,6 +38,27 @@ def like(image: Image8, model: Image8) -> Image8:
         return image
     table = np.clip(gain * (np.arange(256) - mean) + wanted, 0, 255).round().astype(np.uint8)
     return np.asarray(cv2.LUT(image, table), np.uint8)
+
+
+def in_one_light(image: Image8, model: Image8) -> tuple[Image8, Image8]:
+    """Both images as if taken in the same light; of (H, W) uint8, nearly aligned.
+
+    The image gets the contrast and brightness of `model`, where they differ by much. Where the
+    light differs from place to place (a rolling shutter under lamps that flicker, two lenses),
+    both lose what changes slowly: to make one as bright as the other round about would print the
+    other's shades on what is blank.
+    """
+    alike = like(image, model)
+    reach = _LIGHT * min(image.shape) / _CELL
+    size = (image.shape[1] // _CELL, image.shape[0] // _CELL)
+    slow = [cv2.GaussianBlur(cv2.resize(i, size, interpolation=cv2.INTER_AREA), (0, 0), reach)
+            for i in (alike, model)]
+    there, here = (s.astype(np.float32) + _DARK for s in slow)
+    if float(np.percentile(np.abs(np.log(there / here)), _MOSTLY)) < _SAME:
+        return alike, model
+    quick = [cv2.addWeighted(i, 1.0, cv2.resize(s, i.shape[::-1]), -1.0, 128.0)
+             for i, s in zip((alike, model), slow, strict=True)]
+    return np.asarray(quick[0], np.uint8), np.asarray(quick[1], np.uint8)
 
 
 def normalised(image: Image8, contrast: float = 20.0, floor: float = 12.0,

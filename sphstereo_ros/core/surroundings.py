@@ -40,7 +40,7 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
     one, quarter = np.float32(1), np.float32(0.25)
     sign = swept = differs = known = moved = np.float32(0)
     nearer = misfit = information = longest = sines = np.float32(0)
-    low, high = np.float32(255), np.float32(0)
+    low, high = np.float32(2), np.float32(-2)
     for n in range(4):
         r, c = 2 * h + (n >> 1), 2 * w + (n & 1)
         rho, other, matched = full[0, r, c], full[1, r, c], full[2, r, c]
