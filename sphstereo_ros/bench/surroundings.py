@@ -120,6 +120,11 @@ def patches_of(folder: Path, rng: np.random.Generator) -> list[Patch]:
 
 def render(folder: Path) -> None:
     """The scenes that the network is fitted to, beside those of the tuning seeds."""
+    _render_ways(folder)
+    _render_pairs(folder)
+
+
+def _render_ways(folder: Path) -> None:
     jobs: list[tuple[str, int, float | None, str | None]] = []
     for seed in _SEEDS:
         spacing = float(np.random.default_rng(seed).choice([.28, .28, .2, .4]))
@@ -136,7 +141,6 @@ def render(folder: Path) -> None:
         frames: list[TruthFrame] = [sequence[k] for k in _RENDERED]
         save_sequence(frames, target.with_suffix('.part'), name)
         target.with_suffix('.part').rename(target)
-    _render_pairs(folder)
 
 
 def _render_pairs(folder: Path) -> None:

@@ -19,13 +19,12 @@ Evidence = NDArray[np.int8]
 
 MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
 # Of the unit: a likely error with which something counts as measured, by what pixels tell
-# themselves, and together with what is round about. One reference alone is sure of little, so
-# more is left to the frames that follow.
-_SURE, _SURE_BOTH, _SURE_ALONE = 0.8, 0.6, 1.2
+# themselves, and together with what is round about.
+_SURE, _SURE_BOTH = 0.8, 0.7
 _PLAIN = 0.3  # of the unit: with a smaller likely error it counts for two frames
 # Of the unit: what may be nearer by more is not sure, and by still more, what was remembered there
 # is not believed either.
-_NEARER, _VEILED = 0.6, 1.2
+_NEARER, _VEILED = 0.7, 1.35
 _TAIL = 0.75  # of what is published
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
@@ -73,10 +72,9 @@ def by_looks(found: Found, grid: PolarGrid, baselines: Sequence[float]) -> Judge
     sure = found.refined.misfit < MISFIT
     sure &= expected_error(own, unit, found.refined) < np.float32(_SURE) * unit
     told = together(own, wider)
-    limit = _SURE_BOTH if len(baselines) > 1 else _SURE_ALONE
     likely = expected_error(told, unit, found.refined) / unit
     near = may_be_near(told, unit, found.refined.rho, min(baselines))
-    sure &= (likely < np.float32(limit)) & (near < np.float32(_NEARER))
+    sure &= (likely < np.float32(_SURE_BOTH)) & (near < np.float32(_NEARER))
     frames = sure.astype(np.int8) + (sure & (likely < np.float32(_PLAIN)))
     return Judged(found.other, error, np.where(near < np.float32(_VEILED), frames, np.int8(-1)))
 
