@@ -158,8 +158,9 @@ def test_a_saved_fit_is_read_as_it_was(tmp_path):
 @pytest.mark.parametrize(('likely', 'nearer', 'own', 'misfit', 'frames'), [
     (0.1, 0.1, 0.1, 1, 2), (0.5, 0.1, 0.1, 1, 1), (0.9, 0.1, 0.1, 1, 0), (0.1, 0.1, 1.0, 1, 0),
     (0.1, 0.1, 0.1, 200, 0), (0.1, 0.9, 0.1, 1, 0), (0.1, 1.5, 0.1, 1, -1)])
+@pytest.mark.parametrize('baselines', [BASELINES, BASELINES[:1]])
 def test_what_is_told_decides_for_how_much_it_counts(monkeypatch, likely, nearer, own, misfit,
-                                                     frames):
+                                                     frames, baselines):
     """Likely errors and what may be nearer, in units; of pixels and of what is round about."""
     shape = GRID.shape
     rho = np.full(shape, 0.5, np.float32)
@@ -171,6 +172,6 @@ def test_what_is_told_decides_for_how_much_it_counts(monkeypatch, likely, nearer
     refined = Refined(rho, np.full(shape, 1e9, np.float32), np.full(shape, misfit, np.float32))
     monkeypatch.setattr(judgement, 'percentiles', lambda *_: (told(own), rho))
     monkeypatch.setattr(judgement, 'judged', lambda *_: told(likely))
-    judged = by_looks(Found(view, refined, rho, matched, parallax), GRID, BASELINES)
+    judged = by_looks(Found(view, refined, rho, matched, parallax), GRID, baselines)
     assert (judged.frames == frames).all()
     np.testing.assert_allclose(judged.error, likely * rho, rtol=1e-2)
