@@ -577,9 +577,9 @@ def test_a_relative_pose_gives_range_in_baselines():
     assert (got.is_metric, metric.is_metric) == (False, True)
     known = np.isfinite(got.range) & np.isfinite(metric.range)
     assert (np.isfinite(got.range) != np.isfinite(metric.range)).mean() < 0.005
-    # Limits in metres do not apply.
-    for one, other in ((got.range, metric.range), (got.sigma, metric.sigma)):
-        assert np.median(np.abs(0.28 * one[known] / other[known] - 1)) < 1e-3
+    # Limits in metres do not apply. Sigma is told by networks, which see how numbers are rounded.
+    for one, other, alike in ((got.range, metric.range, 1e-3), (got.sigma, metric.sigma, 1e-2)):
+        assert np.median(np.abs(0.28 * one[known] / other[known] - 1)) < alike
 
 
 def test_two_baselines_are_better_than_the_short_one_alone():
