@@ -131,8 +131,8 @@ def test_noise_is_not_believed():
     assert np.mean(together(told, judged(out, GRID.shape))[0] > np.log(0.2)) > 0.9
 
 
-@pytest.mark.parametrize('references', [3, 1])
-def test_sky_behind_leaves_is_refused(monkeypatch, references):
+@pytest.mark.parametrize(('references', 'least'), [(3, 0.85), (1, 0.8)])
+def test_sky_behind_leaves_is_refused(monkeypatch, references, least):
     """On the sample bag: sky that would be measured nearer than 10 m."""
     frames = list(frames_of_bag(Path(__file__).parents[1] / 'bags' / 'street.mcap'))[4:15]
     current = frames[-1]
@@ -149,7 +149,7 @@ def test_sky_behind_leaves_is_refused(monkeypatch, references):
         sure = (found.frames > 0) & (found.sigma < 0.3 * found.rho)
         return (sure & (found.rho > 0.1))[sky].mean(), sure[near].mean()
     ghosts, known = believed()
-    assert known > 0.8
+    assert known > least
     # A network that believes everything leaves the decision to what a pixel tells by itself.
     monkeypatch.setattr(judgement, 'judged', lambda x, shape: np.full((3, *shape), -9.0, 'f4'))
     alone, _ = believed()

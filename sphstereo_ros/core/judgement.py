@@ -20,11 +20,11 @@ Evidence = NDArray[np.int8]
 MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
 # Of the unit: a likely error with which something counts as measured, by what pixels tell
 # themselves, and together with what is round about.
-_SURE, _SURE_BOTH = 0.8, 0.7
+_SURE, _SURE_BOTH = 0.8, 0.6
 _PLAIN = 0.3  # of the unit: with a smaller likely error it counts for two frames
 # Of the unit: what may be nearer by more is not sure, and by still more, what was remembered there
 # is not believed either.
-_NEARER, _VEILED = 0.7, 1.35
+_NEARER, _VEILED = 0.6, 1.2
 _TAIL = 0.75  # of what is published
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
