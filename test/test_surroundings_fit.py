@@ -5,44 +5,33 @@ import cv2
 import numpy as np
 import pytest
 
-from sphstereo_ros.bench.surroundings import (
-    LAYERS,
-    Patch,
-    as_onnx,
-    begun,
-    fit,
-    forward,
-    weights_of,
-)
+from sphstereo_ros.bench.surroundings import DESIGN, Patch, fit
+from sphstereo_ros.bench.unet import plain
 from sphstereo_ros.core.surroundings import CHANNELS
 
 torch = pytest.importorskip('torch')
 pytest.importorskip('onnx')
 
 
-def weights(parts) -> dict[str, np.ndarray]:
-    return {name: part.detach().numpy() for name, part in parts.items()}
-
-
 @pytest.mark.parametrize('shape', [(64, 64), (96, 32)])
 def test_opencv_runs_what_was_fitted(shape):
-    parts = begun(torch.Generator().manual_seed(1))
-    net = cv2.dnn.readNetFromONNX(np.frombuffer(as_onnx(weights(parts)), np.uint8))
+    parts = DESIGN.begun(torch.Generator().manual_seed(1))
+    net = cv2.dnn.readNetFromONNX(np.frombuffer(DESIGN.as_onnx(plain(parts)), np.uint8))
     x = np.random.default_rng(0).normal(size=(1, CHANNELS, *shape)).astype(np.float32)
     net.setInput(x)
     with torch.no_grad():
-        expected = forward(parts, torch.from_numpy(x)).numpy()
-    assert expected.shape == (1, LAYERS['tell'][1], *shape)
+        expected = DESIGN.forward(parts, torch.from_numpy(x)).numpy()
+    assert expected.shape == (1, len(DESIGN.begin), *shape)
     np.testing.assert_allclose(net.forward(), expected, atol=1e-4)
 
 
 def test_a_network_that_was_saved_goes_on():
-    parts = weights(begun(torch.Generator().manual_seed(1)))
-    found = weights_of(as_onnx(parts))
+    parts = plain(DESIGN.begun(torch.Generator().manual_seed(1)))
+    found = DESIGN.weights_of(DESIGN.as_onnx(parts))
     assert found.keys() == parts.keys()
     x = np.zeros((CHANNELS, 64, 64), np.float16)
     nothing = np.zeros((128, 128), np.float32)
-    same = weights(fit([Patch(x, nothing, nothing + 1)], 0, np.random.default_rng(0), found))
+    same = plain(fit([Patch(x, nothing, nothing + 1)], 0, np.random.default_rng(0), found))
     for name, value in parts.items():
         np.testing.assert_array_equal(same[name], value)
 
@@ -56,8 +45,19 @@ def test_a_fit_tells_small_errors_from_large_ones():
     error = (sigma * rng.normal(size=(128, 128))).astype(np.float32)
     parts = fit([Patch(x.astype(np.float16), error, np.ones_like(error))], 60, rng)
     with torch.no_grad():
-        out = forward(parts, torch.from_numpy(x)[None]).numpy()[0]
+        out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
     told = np.exp(out[:4].mean(0))
     small, large = np.median(told[:, 4:28]), np.median(told[:, 36:60])
     assert small == pytest.approx(0.02, rel=0.5)
     assert large == pytest.approx(0.2, rel=0.5)
+
+
+def test_one_that_saw_less_goes_on():
+    parts = plain(DESIGN.begun(torch.Generator().manual_seed(1)))
+    narrow = {name: value[:, :-5] if name == 'enter.weight' else value
+              for name, value in parts.items()}
+    nothing = np.zeros((128, 128), np.float32)
+    x = np.zeros((CHANNELS, 64, 64), np.float16)
+    wide = plain(fit([Patch(x, nothing, nothing + 1)], 0, np.random.default_rng(0), narrow))
+    assert wide['enter.weight'].shape == parts['enter.weight'].shape
+    np.testing.assert_array_equal(wide['enter.weight'][:, :-5], narrow['enter.weight'])

@@ -54,6 +54,25 @@ class Samples:
     weight: Floats
 
 
+def true_on_grid(truth: TruthFrame, grid: PolarGrid, axes: NDArray[np.float64],
+             rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
+    """True inverse range (N,), 1/m, of pixels of a polar grid; NaN where it is unknown or moves.
+
+    axes : (3, 3) of the grid, optical frame of `truth`
+    """
+    theta, azimuth = grid.theta()[columns], grid.azimuth()[rows]
+    sine = np.sin(theta)
+    x, y, z = axes @ [np.cos(azimuth) * sine, np.sin(azimuth) * sine, np.cos(theta)]
+    height, width = truth.range.shape
+    v = np.clip(((0.5 + np.arcsin(np.clip(y, -1, 1)) / np.pi) * height).astype(np.intp), 0,
+                height - 1)
+    u = ((np.arctan2(x, z) / (2 * np.pi) + 0.5) * width).astype(np.intp) % width
+    true = (1 / np.maximum(truth.range, 1e-3)).astype(np.float32)
+    if truth.moving is not None:
+        true[truth.moving] = np.nan
+    return np.asarray(true[v, u])
+
+
 class Watched(JointMatcher):
     """Shows what it found of a window to `watch`, in place of a judgement."""
 
@@ -76,17 +95,7 @@ class Watched(JointMatcher):
     def true(self, grid: PolarGrid, axes: NDArray[np.float64], rows: NDArray[np.int64],
              columns: NDArray[np.int64]) -> Floats:
         """Inverse range, 1/m; NaN where it is unknown or moves."""
-        theta, azimuth = grid.theta()[columns], grid.azimuth()[rows]
-        sine = np.sin(theta)
-        x, y, z = axes @ [np.cos(azimuth) * sine, np.sin(azimuth) * sine, np.cos(theta)]
-        height, width = self._truth.range.shape
-        v = np.clip(((0.5 + np.arcsin(np.clip(y, -1, 1)) / np.pi) * height).astype(np.intp), 0,
-                    height - 1)
-        u = ((np.arctan2(x, z) / (2 * np.pi) + 0.5) * width).astype(np.intp) % width
-        true = (1 / np.maximum(self._truth.range, 1e-3)).astype(np.float32)
-        if self._truth.moving is not None:
-            true[self._truth.moving] = np.nan
-        return np.asarray(true[v, u])
+        return true_on_grid(self._truth, grid, axes, rows, columns)
 
 
 class _Sampled(Watched):

@@ -10,11 +10,10 @@ without.
 from __future__ import annotations
 
 import argparse
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,10 +35,7 @@ from sphstereo_ros.scenes.sequence import (
 
 from .accuracy import as_frame
 from .reliability import MOST, PERCENTILES, Watched, disturbed
-
-Floats = NDArray[np.floating]
-Parameters = dict[str, Any]  # name of a layer → weight and bias
-Node = TypeVar('Node')
+from .unet import Design, Parameters, percentile_loss, plain
 
 _SEEDS, _PAIR_SEEDS = range(11, 61), range(61, 81)
 _RENDERED = (1, 7, 10, 11)  # frames of a sequence
@@ -51,23 +47,12 @@ _TURNED = 4.0  # degrees about each axis at most, of a pair's top camera
 # Weights of what is 10 to 100 m away, and of what is near but was found far.
 _RARE, _TOO_FAR = 2.0, 2.0
 _WIDTHS = (16, 32, 48, 64, 64, 64)  # channels at half size, a quarter, …
-_DEEPEST = len(_WIDTHS) - 1
 _LAST = 32
-_LEAK, _BEGIN = 0.1, -2.3  # logarithm of the error that it starts from
-_ROWS, _BATCH, _RATE = 192, 3, 3e-3
+_BEGIN = -2.3  # logarithm of the error that it starts from
+_ROWS, _BATCH = 192, 3
 
 
-def _layers() -> dict[str, tuple[int, int, int, int]]:
-    """Inputs, outputs, size of the kernel and step of the network's layers, by name."""
-    found = {'enter': (CHANNELS, _WIDTHS[0], 3, 1)}
-    for n, (fine, coarse) in enumerate(itertools.pairwise(_WIDTHS), 1):
-        found[f'down{n}'], found[f'stay{n}'] = (fine, coarse, 3, 2), (coarse, coarse, 3, 1)
-        found[f'up{n - 1}'] = (coarse, fine, 1, 1)
-        found[f'join{n - 1}'] = (fine, fine if n > 1 else _LAST, 3, 1)
-    return found | {'tell': (_LAST, 4 * len(PERCENTILES), 1, 1)}
-
-
-LAYERS = _layers()
+DESIGN = Design(CHANNELS, _WIDTHS, _LAST, [_BEGIN] * (4 * len(PERCENTILES)))
 
 
 @dataclass(frozen=True)
@@ -159,62 +144,11 @@ def _render_pairs(folder: Path) -> None:
         target.with_suffix('.part').rename(target)
 
 
-def begun(generator: Any) -> Parameters:
-    """Weights to start from (He et al. 2015)."""
-    import torch
-    made = {}
-    for name, (inside, outside, size, _) in LAYERS.items():
-        spread = 0.01 if name == 'tell' else np.sqrt(2 / (inside * size**2))
-        weight = spread * torch.randn(outside, inside, size, size, generator=generator)
-        made[f'{name}.weight'] = weight.requires_grad_()
-        bias = torch.full((outside,), _BEGIN if name == 'tell' else 0.0)
-        made[f'{name}.bias'] = bias.requires_grad_()
-    return made
-
-
-def walk(x: Node, layer: Callable[[str, Node], Node], bent: Callable[[Node], Node],
-         joined: Callable[[Node, Node], Node]) -> Node:
-    """Walk the network's graph from x to what comes out, each step done by the caller's means.
-
-    layer : by its name in LAYERS; bent : the activation; joined : (coarse, fine) → fine plus
-    coarse at twice the size
-    """
-    levels = [bent(layer('enter', x))]
-    for n in range(1, _DEEPEST + 1):
-        levels.append(bent(layer(f'stay{n}', bent(layer(f'down{n}', levels[-1])))))
-    y = levels[_DEEPEST]
-    for n in range(_DEEPEST - 1, 0, -1):
-        y = bent(layer(f'join{n}', joined(layer(f'up{n}', y), levels[n])))
-    y = bent(joined(layer('up0', y), levels[0]))
-    return layer('tell', bent(layer('join0', y)))
-
-
-def forward(parts: Parameters, x: Any) -> Any:
-    """Outputs (N, 4 · percentiles, rows, columns) of x (N, CHANNELS, rows, columns)."""
-    from torch.nn import functional
-
-    def layer(name: str, x: Any) -> Any:
-        size, step = LAYERS[name][2:]
-        return functional.conv2d(x, parts[f'{name}.weight'], parts[f'{name}.bias'], step,
-                                 size // 2)
-
-    def bent(x: Any) -> Any:
-        return functional.leaky_relu(x, _LEAK)
-
-    def joined(coarse: Any, fine: Any) -> Any:
-        return fine + functional.interpolate(coarse, scale_factor=2, mode='nearest')
-    return walk(x, layer, bent, joined)
-
-
 def loss(out: Any, error: Any, weight: Any) -> Any:
-    """Of the percentiles (quantile regression, Koenker and Bassett 1978), summed over them."""
-    import torch
+    """Of the percentiles of each pixel."""
     from torch.nn import functional
-    sizes = torch.cat([error.abs(), error.abs(), error.clamp(min=0)], 1)
-    difference = torch.log(LEAST + sizes.clamp(max=MOST)) - functional.pixel_shuffle(out, 2)
-    share = torch.tensor(PERCENTILES).view(1, -1, 1, 1)
-    each = torch.maximum(share * difference, (share - 1) * difference)
-    return (each * weight).sum() / weight.sum()
+    return percentile_loss(functional.pixel_shuffle(out, 2), error, weight, LEAST, MOST,
+                           PERCENTILES)
 
 
 def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, Any, Any]:
@@ -244,73 +178,11 @@ def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, Any, Any]:
 
 def fit(patches: Sequence[Patch], steps: int, rng: np.random.Generator,
         start: dict[str, NDArray[np.float32]] | None = None) -> Parameters:
-    """Weights after so many steps of Adam (Kingma and Ba 2014), from `start` if there is one."""
-    import torch
-    parts = begun(torch.Generator().manual_seed(0))
-    for name, value in (start or {}).items():
-        parts[name].data.copy_(torch.from_numpy(value.copy()))
-    adam = torch.optim.Adam(parts.values(), _RATE)
-    progress = tqdm(range(steps), unit='step')
-    for number in progress:
-        slower = 0.5 * (1 + np.cos(np.pi * number / steps)) + 0.002
-        adam.param_groups[0]['lr'] = _RATE * min(1, (number + 1) / 100) * slower
-        adam.zero_grad()
-        total = 0.0
-        for _ in range(_BATCH):
-            x, error, weight = _varied(patches[int(rng.integers(len(patches)))], rng)
-            x = x.contiguous(memory_format=torch.channels_last)  # four times as fast
-            part = loss(forward(parts, x), error, weight) / _BATCH
-            part.backward()
-            total += part.item()
-        torch.nn.utils.clip_grad_norm_(parts.values(), 1.0)
-        adam.step()
-        progress.set_postfix(loss=round(total, 3))
-    return parts
-
-
-def as_onnx(weights: dict[str, NDArray[np.float32]]) -> bytes:
-    """The network as OpenCV reads it."""
-    import onnx
-    from onnx import helper, numpy_helper
-    nodes, kept = [], [numpy_helper.from_array(np.array([1, 1, 2, 2], np.float32), 'twice'),
-                       numpy_helper.from_array(np.array([], np.float32), 'all')]
-
-    def node(kind: str, inputs: list[str], out: str, **options: Any) -> str:
-        nodes.append(helper.make_node(kind, inputs, [out], **options))
-        return out
-
-    def layer(name: str, x: str) -> str:
-        size, step = LAYERS[name][2:]
-        kept.extend(numpy_helper.from_array(weights[f'{name}.{part}'], f'{name}.{part}')
-                    for part in ('weight', 'bias'))
-        return node('Conv', [x, f'{name}.weight', f'{name}.bias'], name, kernel_shape=[size] * 2,
-                    strides=[step] * 2, pads=[size // 2] * 4)
-
-    def bent(x: str) -> str:
-        return node('LeakyRelu', [x], f'{x}.bent', alpha=_LEAK)
-
-    def joined(coarse: str, fine: str) -> str:
-        larger = node('Resize', [coarse, 'all', 'twice'], f'{coarse}.larger', mode='nearest',
-                      coordinate_transformation_mode='asymmetric', nearest_mode='floor')
-        return node('Add', [fine, larger], f'{coarse}.sum')
-    out = walk('x', layer, bent, joined)
-    kind = onnx.TensorProto.FLOAT
-    graph = helper.make_graph(
-        nodes, 'surroundings', [helper.make_tensor_value_info('x', kind, [1, CHANNELS, 64, 64])],
-        [helper.make_tensor_value_info(out, kind, [1, LAYERS[out][1], 64, 64])], kept)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid('', 12)])
-    model.ir_version = 7
-    onnx.checker.check_model(model)
-    return bytes(model.SerializeToString())
-
-
-def weights_of(model: bytes) -> dict[str, NDArray[np.float32]]:
-    """The weights in what `as_onnx` made, by name."""
-    import onnx
-    from onnx import numpy_helper
-    graph = onnx.load_from_string(model).graph
-    found = {t.name: numpy_helper.to_array(t) for t in graph.initializer}
-    return {name: value for name, value in found.items() if name.partition('.')[0] in LAYERS}
+    """Weights after so many steps, from `start` if there is one."""
+    def part(network: Callable[[Any], Any]) -> Any:
+        x, error, weight = _varied(patches[int(rng.integers(len(patches)))], rng)
+        return loss(network(x), error, weight)
+    return DESIGN.fitted(part, steps, _BATCH, start)
 
 
 def main() -> None:
@@ -329,9 +201,8 @@ def main() -> None:
         return
     rng = np.random.default_rng(0)
     patches = [p for f in tqdm(args.folders, unit='folder') for p in patches_of(f, rng)]
-    start = weights_of(args.start.read_bytes()) if args.start else None
-    parts = fit(patches, args.steps, rng, start)
-    args.out.write_bytes(as_onnx({name: p.detach().numpy() for name, p in parts.items()}))
+    start = DESIGN.weights_of(args.start.read_bytes()) if args.start else None
+    args.out.write_bytes(DESIGN.as_onnx(plain(fit(patches, args.steps, rng, start))))
 
 
 if __name__ == '__main__':

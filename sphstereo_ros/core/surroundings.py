@@ -9,15 +9,13 @@ outputs are the same percentiles. It was fitted to rendered scenes with exact ra
 """
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from functools import cache
-from importlib.resources import files
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .convolutions import Convolutions
 from .frames import Image8
 from .jit import fast_kernel, rows_in_parallel
 from .matching import UNKNOWN
@@ -28,7 +26,6 @@ CHANNELS = 25
 BLOCK = 32  # px at half size: what the network halves five times
 _ROUND = 32  # px at half size that it sees beyond the seam
 _LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24)  # of the inputs
-_LOCK = threading.Lock()
 
 
 @fast_kernel
@@ -131,9 +128,8 @@ def interior(maps: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.fl
 
 
 @cache
-def _network() -> cv2.dnn.Net:
-    data = (files('sphstereo_ros.core') / 'surroundings.onnx').read_bytes()
-    return cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
+def _network() -> Convolutions:
+    return Convolutions('surroundings.onnx')
 
 
 def judged(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -142,10 +138,6 @@ def judged(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32
     x : of `inputs`
     shape : of the polar grid
     """
-    with _LOCK:  # a network of OpenCV holds what it computes
-        net = _network()
-        net.setInput(x)
-        out = net.forward()
-    found = interior(out, shape)
+    found = interior(_network()(x), shape)
     parts = found.reshape(3, 2, 2, *found.shape[2:])
     return np.ascontiguousarray(parts.transpose(0, 3, 1, 4, 2)).reshape(3, *shape)

@@ -1,0 +1,24 @@
+"""Convolutional networks as files, run by OpenCV."""
+from __future__ import annotations
+
+import threading
+from importlib.resources import files
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+
+class Convolutions:
+    """A network that is shipped in this folder; any thread may run it."""
+
+    def __init__(self, name: str) -> None:
+        data = (files('sphstereo_ros.core') / name).read_bytes()
+        self._net = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
+        self._lock = threading.Lock()
+
+    def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Outputs (1, outputs, rows, columns) of x (1, channels, rows, columns), as its own."""
+        with self._lock:  # a network of OpenCV holds what it computes
+            self._net.setInput(x)
+            return np.array(self._net.forward())
