@@ -16,7 +16,7 @@ from sphstereo_ros.core.matching import (
 )
 
 MATCHERS = PARAMETERS['stereo.matcher'].choices
-ONE_SIDED = ('bm', 'sgbm', 'joint_fast')  # their search ends at zero
+ONE_SIDED = ('bm', 'bm_judged', 'sgbm', 'joint_fast')  # their search ends at zero
 ROWS, COLUMNS = 200, 240
 INSIDE = (slice(20, -20), slice(70, -20))
 
@@ -54,7 +54,7 @@ def test_a_known_shift_is_found_with_its_sign_and_fraction(name, parallax):
     inside = found.pixels[INSIDE][known(found)[INSIDE]]
     assert len(inside) > 0.8 * found.pixels[INSIDE].size
     # OpenCV's block matchers lean toward whole pixels.
-    bias = {'bm': 0.1, 'joint_fast': 0.1, 'sgbm': 0.3}.get(name, 0.06)
+    bias = {'bm': 0.1, 'bm_judged': 0.1, 'joint_fast': 0.1, 'sgbm': 0.3}.get(name, 0.06)
     assert np.median(inside) == pytest.approx(parallax, abs=bias)
     assert np.median(np.abs(inside - parallax)) < (0.5 if name == 'flow_fast' else 0.3)
 

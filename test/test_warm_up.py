@@ -50,7 +50,7 @@ for one in windows:
 @pytest.mark.parametrize(('stage', 'parameters'), [
     ('stabiliser', {}), ('aligner', {}), ('aligner', {'alignment.method': 'paper'}),
     *(('stereo', {'stereo.matcher': m}) for m in (
-        'joint', 'joint_fast', 'hybrid', 'flow', 'bm'))],
+        'joint', 'joint_fast', 'hybrid', 'flow', 'bm', 'bm_judged'))],
     ids=lambda p: p if isinstance(p, str) else '-'.join(p.values()) or 'default')
 def test_nothing_is_compiled_after_the_warm_up(stage: str, parameters: dict[str, str],
                                                tmp_path: Path) -> None:

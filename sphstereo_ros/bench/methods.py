@@ -8,7 +8,7 @@ from sphstereo_ros.replay.parameter_files import load_values
 
 from .processes import shipped
 
-MATCHERS = ('hybrid', 'flow', 'flow_fast', 'bm', 'sgbm')
+MATCHERS = ('hybrid', 'flow', 'flow_fast', 'bm', 'bm_judged', 'sgbm')
 ONE_REFERENCE: Mapping[str, object] = {'pairing.intervals': [1]}
 
 

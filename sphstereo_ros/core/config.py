@@ -215,8 +215,10 @@ class StereoConfig:
     matcher: str = _p('stereo.matcher', 'joint', 'joint: all references together, checked by a '
                       'second method and by the frames before; joint_fast: the same from bm, '
                       'checked by itself; pair by pair: flow, flow_fast: dense flow with checks; '
-                      'bm, sgbm: as in OpenCV; hybrid: flow averaged with bm',
-                      choices=('joint', 'joint_fast', 'hybrid', 'flow', 'flow_fast', 'bm', 'sgbm'))
+                      'bm, sgbm: as in OpenCV; bm_judged: bm without what looks wrong; hybrid: '
+                      'flow averaged with bm',
+                      choices=('joint', 'joint_fast', 'hybrid', 'flow', 'flow_fast', 'bm',
+                               'bm_judged', 'sgbm'))
     memory: float = _p('stereo.memory', 0.45, 'joint matchers: how long a range is kept that no '
                        'newer frame confirms; 0 = every frame by itself', unit='s', low=0.0,
                        high=0.5)

@@ -230,9 +230,9 @@ def semi_global_matcher(disparities: int, block: int) -> Matcher:
 
 
 def matcher(config: StereoConfig) -> Matcher:
-    """The matcher that `config` names; of a joint one, that of the nearest pair."""
+    """The matcher that `config` names, unjudged; of a joint one, that of the nearest pair."""
     block = block_matcher(config.num_disparities, config.block_size)
-    if config.matcher in ('bm', 'joint_fast'):
+    if config.matcher in ('bm', 'bm_judged', 'joint_fast'):
         return block
     if config.matcher == 'sgbm':
         return semi_global_matcher(config.num_disparities, min(config.block_size, 7))

@@ -20,13 +20,19 @@ from .frames import (
 from .inverse_range import NOTHING, InverseRange, fuse, inverse_range, published_range
 from .islands import far_islands
 from .joint import JointMatcher
-from .matching import matcher, stereo_grid
+from .match_judge import judged_matcher
+from .matching import Matcher, matcher, stereo_grid
 from .moving import floor_plane, moving_parts, under_floor
 from .pair_matching import PairMatcher, with_cones
 from .range_memory import RangeMemory
 from .rig import Rig
 from .rotations import mount
 from .warp import aligned_pair
+
+
+def _matcher(config: Config) -> Matcher:
+    match = matcher(config.stereo)
+    return judged_matcher(match) if config.stereo.matcher == 'bm_judged' else match
 
 
 class SphericalStereo:
@@ -38,7 +44,7 @@ class SphericalStereo:
 
     def __init__(self, config: Config, mask: Image8 | None = None) -> None:
         self.config = config
-        self._match = matcher(config.stereo)
+        self._match = _matcher(config)
         self._joint: JointMatcher | None = None
         if config.stereo.matcher in ('joint', 'joint_fast'):
             self._joint = JointMatcher(config.stereo.matcher, self._match,

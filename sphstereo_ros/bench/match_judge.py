@@ -1,0 +1,143 @@
+"""Fits the network of `sphstereo_ros.core.match_judge` to scenes with exact range.
+
+    python -m sphstereo_ros.bench.match_judge OUT.onnx FOLDER...
+
+FOLDER holds a sequence that `sphstereo_ros.bench.surroundings render` made. Needs torch and onnx
+(extra `fit`).
+"""
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from sphstereo_ros.core.config import resolve
+from sphstereo_ros.core.match_judge import BLOCK, CHANNELS, ROUND, inputs
+from sphstereo_ros.core.matching import UNKNOWN, block_matcher, stereo_grid
+from sphstereo_ros.core.reliability import LEAST
+from sphstereo_ros.core.warp import aligned_pair
+from sphstereo_ros.replay.parameter_files import load_values
+from sphstereo_ros.scenes.sequence import TruthFrame, load_sequence, true_pose
+
+from .accuracy import as_frame
+from .processes import shipped
+from .reliability import MOST, PERCENTILES, disturbed, true_on_grid
+from .unet import Design, Parameters, percentile_loss, plain
+
+# Pairs of a sequence (current frame, reference), and the rows that they are matched at.
+_PAIRS = ((3, 2), (3, 1), (2, 1))
+_HEIGHTS = (480, 384)
+_TOO_FAR = 2.0  # weight of what is near, but was found far
+_BEGIN = -2.3  # logarithm of the error that it starts from
+_ROWS, _BATCH = 160, 4
+
+# Four times four pixels at half size are told of by one of the network's.
+DESIGN = Design(CHANNELS, (16, 24, 32, 32), 24, [_BEGIN] * (16 * len(PERCENTILES)), step=2)
+
+
+@dataclass(frozen=True)
+class Patch:
+    """What the network sees of a pair, and the truth, on its polar grid.
+
+    x : float16 (CHANNELS, rows, columns); error : float16 (4 rows, 4 columns), true less found
+    parallax as a share of it (of a pixel at least); weight : the same, 0 where nothing was found
+    """
+
+    x: NDArray[np.float16]
+    error: NDArray[np.float16]
+    weight: NDArray[np.float16]
+
+
+def patch_of(current: TruthFrame, reference: TruthFrame, height: int,
+             rng: np.random.Generator) -> Patch:
+    """A pair, matched at `height` rows."""
+    stereo = resolve(load_values([shipped('config/live.yaml')])).stereo
+    pose, grid = disturbed(true_pose(reference, current), rng), stereo_grid(height)
+    there, here, axes = aligned_pair(as_frame(reference, height).image,
+                                     as_frame(current, height).image, pose, grid)
+    found = block_matcher(stereo.num_disparities, stereo.block_size)(here, there)
+    rows, columns = (n.ravel() for n in np.indices(grid.shape))
+    rho = true_on_grid(current, grid, axes, rows, columns).reshape(grid.shape)
+    theta = grid.theta()[None]
+    moved = np.arctan2(np.sin(theta), np.cos(theta) + rho * pose.baseline)
+    true = (theta - moved) / grid.pixel
+    error = (true - found.pixels) / np.maximum(found.pixels, 1)
+    weight = np.isfinite(true) * np.maximum(np.sin(theta), 0.02)
+    weight *= np.where((rho > 0.1) & (found.pixels < true / 1.5), _TOO_FAR, 1)
+    weight[found.pixels == UNKNOWN] = 0
+    x = inputs(here, there, found)[0, :, ROUND:ROUND + grid.shape[0] // 4, :grid.shape[1] // 4]
+    return Patch(x.astype(np.float16),
+                 np.clip(np.nan_to_num(error), -99, 99).astype(np.float16),
+                 weight.astype(np.float16))
+
+
+def patches_of(folder: Path, rng: np.random.Generator) -> list[Patch]:
+    """Patches of all pairs of a sequence, each at one of the heights."""
+    sequence = load_sequence(folder)
+    return [patch_of(sequence[a], sequence[b], int(rng.choice(_HEIGHTS)), rng)
+            for a, b in _PAIRS if max(a, b) < len(sequence)]
+
+
+def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, Any, Any]:
+    """A part of a patch, at half size one pixel of four, in another light or mirrored."""
+    import torch
+    height = min(_ROWS, patch.x.shape[1] // BLOCK * BLOCK)
+    first = int(rng.integers(0, patch.x.shape[1] - height + 1))
+    beyond = -patch.x.shape[2] % BLOCK
+    part = np.pad(patch.x[:, first:first + height], ((0, 0), (0, 0), (0, beyond)), 'edge')
+    x = torch.from_numpy(part.astype(np.float32))[None]
+    rows = slice(4 * first, 4 * (first + height))
+    one_of_four = np.s_[int(rng.integers(2))::2, int(rng.integers(2))::2]
+    error, weight = (torch.from_numpy(np.pad(m[rows][one_of_four].astype(np.float32), (
+        (0, 0), (0, 2 * beyond))))[None, None] for m in (patch.error, patch.weight))
+    gain, offset = float(np.exp(rng.normal(0, 0.25))), float(rng.normal(0, 0.3))
+    x[:, 8:12] = (x[:, 8:12] * gain + offset).clamp(-2, 2)
+    x[:, 12:16] = torch.log(2 + gain * (torch.exp(x[:, 12:16] + 2) - 2)) - 2
+    x[:, 19] *= gain
+    if rng.random() < 0.15:
+        x[:, 8:12] *= -1
+    if rng.random() < 0.5:
+        x, error, weight = (torch.flip(m, [2]) for m in (x, error, weight))
+        for at in (0, 4, 8, 12):
+            x[:, at:at + 4] = x[:, at:at + 4][:, [2, 3, 0, 1]]
+    return x, error, weight
+
+
+def loss(out: Any, error: Any, weight: Any) -> Any:
+    """Of the percentiles of each pixel at half size."""
+    from torch.nn import functional
+    return percentile_loss(functional.pixel_shuffle(out, 4), error, weight, LEAST, MOST,
+                           PERCENTILES)
+
+
+def fit(patches: Sequence[Patch], steps: int, rng: np.random.Generator,
+        start: dict[str, NDArray[np.float32]] | None = None) -> Parameters:
+    """Weights after so many steps, from `start` if there is one."""
+    def part(network: Callable[[Any], Any]) -> Any:
+        x, error, weight = _varied(patches[int(rng.integers(len(patches)))], rng)
+        return loss(network(x), error, weight)
+    return DESIGN.fitted(part, steps, _BATCH, start)
+
+
+def main() -> None:
+    """Fit and save."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
+    parser.add_argument('out', type=Path)
+    parser.add_argument('folders', type=Path, nargs='+')
+    parser.add_argument('--steps', type=int, default=4000)
+    parser.add_argument('--start', type=Path, help='network to go on from')
+    args = parser.parse_args()
+    rng = np.random.default_rng(0)
+    patches = [p for f in tqdm(args.folders, unit='folder') for p in patches_of(f, rng)]
+    start = DESIGN.weights_of(args.start.read_bytes()) if args.start else None
+    args.out.write_bytes(DESIGN.as_onnx(plain(fit(patches, args.steps, rng, start))))
+
+
+if __name__ == '__main__':
+    main()
