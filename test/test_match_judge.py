@@ -98,7 +98,7 @@ def test_what_is_told_decides_what_stands(seed):
     size = np.maximum(before, 1)
     sine = np.abs(np.sin(GRID.theta()))[None]
     near = before + nearer * size > 64 / np.pi / 40 * sine
-    stands = (before != UNKNOWN) & (likely <= 0.25) & ~((nearer > 0.2) & near)
+    stands = (before != UNKNOWN) & (likely <= 0.25) & ~((nearer > 0.25) & near)
     wrong = (after.pixels != UNKNOWN) != stands
     assert wrong.mean() < 1e-3  # on the very border
     np.testing.assert_array_equal(after.pixels[stands & ~wrong], before[stands & ~wrong])

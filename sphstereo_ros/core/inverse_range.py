@@ -173,17 +173,18 @@ def pose_sigmas(pose: RelativePose) -> tuple[float, float, float]:
     return rotation**0.5, across**0.5, along**0.5
 
 
-def fuse(estimates: list[InverseRange]) -> InverseRange:
+def fuse(estimates: list[InverseRange], judged: bool = False) -> InverseRange:
     """Average by inverse variance what agrees within three standard deviations, nearest first.
 
     Where a longer baseline contradicts what is already there, it is wrong as a rule (its search or
     its occlusions): the shorter one's estimate stays. Where a search that ends takes part, a
-    longer baseline does not speak alone: it reports what is nearer than its search as far.
+    longer baseline does not speak alone, unless it is judged: it reports what is nearer than its
+    search as far.
     """
     rho, sigma, signed = estimates[0].rho, estimates[0].sigma, estimates[0].signed
     for more in estimates[1:]:
         agrees = np.abs(more.rho - rho) < _CONFIDENT * np.hypot(more.sigma, sigma)
-        if not more.signed:
+        if not (more.signed or judged):
             agrees &= sigma < NOTHING
         w0, w1 = 1 / sigma**2, 1 / more.sigma**2
         rho = np.where(agrees, (w0 * rho + w1 * more.rho) / (w0 + w1), rho)

@@ -26,7 +26,7 @@ _FINER = 4  # px at half size, each way, that the network tells of by one of its
 ROUND = 16  # px at a quarter of the size that it sees beyond the seam
 _LOGARITHMS = (0, 1, 2, 3, 12, 13, 14, 15, 16, 17)  # of the inputs
 # Of the unit: a likely error with which a match stands, and what may be nearer with which not.
-_SURE, _NEARER = 0.25, 0.2
+_SURE, _NEARER = 0.25, 0.25
 _NEAR = 1 / 40  # rad at right angles to the motion: nearer than that matters (40 baselines)
 TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
 

@@ -98,7 +98,8 @@ class SphericalStereo:
         elif self._joint is not None:
             estimate, moving = self._remembered(self._joint, window, mask)
         else:
-            estimate = fuse([self._measure(window.current, r) for r in window.references])
+            estimate = fuse([self._measure(window.current, r) for r in window.references],
+                            self.config.stereo.matcher == 'bm_judged')
         r, sigma = published_range(estimate, self.config.range, window.is_metric, mask)
         if self._joint is not None and window.is_metric:
             hidden = far_islands(r)
