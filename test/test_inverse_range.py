@@ -236,6 +236,16 @@ def test_what_one_does_not_know_the_other_says():
     assert np.isnan(published_range(none, LIMITS, True)[0]).all()
 
 
+def test_a_search_that_ends_does_not_speak_alone_unless_it_is_judged():
+    """It would report what is nearer than its search as far."""
+    unknown, far = estimate([0.0], [NOTHING], False), estimate([0.02], [0.001], False)
+    assert fuse([unknown, far]).sigma == NOTHING
+    judged = fuse([unknown, far], judged=True)
+    np.testing.assert_allclose([judged.rho, judged.sigma], [[[0.02]], [[0.001]]], rtol=1e-5)
+    near = estimate([0.2], [0.001], False)  # what the shorter one says stands
+    np.testing.assert_allclose(fuse([near, far], judged=True).rho, 0.2, rtol=1e-6)
+
+
 def test_three_that_agree_are_better_than_two():
     out = fuse([estimate([0.2], [0.01])] * 3)
     np.testing.assert_allclose(out.sigma, 0.01 / np.sqrt(3), rtol=1e-5)
