@@ -21,18 +21,13 @@ from .inverse_range import NOTHING, InverseRange, fuse, inverse_range, published
 from .islands import far_islands
 from .joint import JointMatcher
 from .match_judge import judged_matcher
-from .matching import Matcher, matcher, stereo_grid
+from .matching import matcher, stereo_grid
 from .moving import floor_plane, moving_parts, under_floor
 from .pair_matching import PairMatcher, with_cones
 from .range_memory import RangeMemory
 from .rig import Rig
 from .rotations import mount
 from .warp import aligned_pair
-
-
-def _matcher(config: Config) -> Matcher:
-    match = matcher(config.stereo)
-    return judged_matcher(match) if config.stereo.matcher == 'bm_judged' else match
 
 
 class SphericalStereo:
@@ -44,7 +39,10 @@ class SphericalStereo:
 
     def __init__(self, config: Config, mask: Image8 | None = None) -> None:
         self.config = config
-        self._match = _matcher(config)
+        self._match = matcher(config.stereo)
+        self._judged = config.stereo.matcher == 'bm_judged'
+        if self._judged:
+            self._match = judged_matcher(self._match)
         self._joint: JointMatcher | None = None
         if config.stereo.matcher in ('joint', 'joint_fast'):
             self._joint = JointMatcher(config.stereo.matcher, self._match,
@@ -99,9 +97,10 @@ class SphericalStereo:
             estimate, moving = self._remembered(self._joint, window, mask)
         else:
             estimate = fuse([self._measure(window.current, r) for r in window.references],
-                            self.config.stereo.matcher == 'bm_judged')
+                            self._judged)
+            estimate = self._above_floor(estimate) if self._judged else estimate
         r, sigma = published_range(estimate, self.config.range, window.is_metric, mask)
-        if self._joint is not None and window.is_metric:
+        if (self._joint is not None or self._judged) and window.is_metric:
             hidden = far_islands(r)
             r[hidden] = sigma[hidden] = np.nan
         return RangeImage(window.current.key, r, sigma, window.is_metric, moving=moving,
