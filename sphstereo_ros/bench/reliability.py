@@ -55,7 +55,7 @@ class Samples:
 
 
 def true_on_grid(truth: TruthFrame, grid: PolarGrid, axes: NDArray[np.float64],
-             rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
+                 rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
     """True inverse range (N,), 1/m, of pixels of a polar grid; NaN where it is unknown or moves.
 
     axes : (3, 3) of the grid, optical frame of `truth`
