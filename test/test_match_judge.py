@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from room import forward
 
 from sphstereo_ros.bench.accuracy import as_frame
-from sphstereo_ros.bench.match_judge import patches_of
+from sphstereo_ros.bench.match_judge import patch_of
 from sphstereo_ros.bench.obstacles import frames_of_bag
-from sphstereo_ros.core import match_judge
+from sphstereo_ros.core import match_judge, stereo
 from sphstereo_ros.core.config import resolve
-from sphstereo_ros.core.frames import AlignedWindow, Reference
+from sphstereo_ros.core.frames import AlignedWindow, Reference, RelativePose
 from sphstereo_ros.core.match_judge import CHANNELS, TAIL, inputs, judged_matcher
 from sphstereo_ros.core.matching import MARGIN, UNKNOWN, Parallax, stereo_grid
 from sphstereo_ros.core.reliability import LEAST
 from sphstereo_ros.core.stereo import SphericalStereo
-from sphstereo_ros.scenes.sequence import render_sequence, save_sequence, true_pose
+from sphstereo_ros.scenes.sequence import render_sequence, true_pose
 
 GRID = stereo_grid(64)
 ROUND, WRAP = 16, MARGIN // 4  # rows at a quarter of the size
@@ -123,10 +124,10 @@ def test_what_looks_wrong_is_refused():
         as_frame(frames[-2], 480), true_pose(frames[-2], frames[-1])),))
     shares = {}
     for name in ('bm', 'bm_judged'):
-        stereo = SphericalStereo(resolve({
+        judged_or_not = SphericalStereo(resolve({
             'stereo.matcher': name, 'stereo.num_disparities': 48, 'stereo.block_size': 11,
             'baseline.source': 'odometry'}))
-        r = stereo.process(window).range
+        r = judged_or_not.process(window).range
         near, sky = truth < 10, np.isposinf(truth)
         shares[name] = ((r[sky] < 10).mean(), (r[near] > 1.5 * truth[near]).mean(),
                         np.isfinite(r[near]).mean())
@@ -136,12 +137,34 @@ def test_what_looks_wrong_is_refused():
     assert judged[2] > 0.8 * plain[2]
 
 
-def test_a_pair_is_fitted_to(tmp_path):
+@pytest.mark.parametrize(('matcher', 'looks'), [('bm', False), ('bm_judged', True)])
+def test_mirrors_and_what_is_under_the_floor_are_looked_for(monkeypatch, matcher, looks):
+    frames = forward(2, 0.2, 64)
+    pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -0.2]), 1e-9 * np.eye(6))
+    window = AlignedWindow(frames[1], (Reference(frames[0], pose),))
+    everywhere = np.ones((64, 128), bool)
+
+    def known() -> bool:
+        return bool(np.isfinite(SphericalStereo(resolve({
+            'stereo.matcher': matcher, 'stereo.num_disparities': 16, 'stereo.block_size': 5,
+            'baseline.source': 'odometry'})).process(window).range).any())
+    monkeypatch.setattr(match_judge, 'told', lambda x, shape: np.full(
+        (3, shape[0] // 2, shape[1] // 2), -5, np.float32))  # everything is believed
+    assert known()
+    with monkeypatch.context() as patch:
+        patch.setattr(stereo, 'far_islands', lambda r: everywhere)
+        assert known() != looks
+    with monkeypatch.context() as patch:
+        patch.setattr(stereo, 'floor_plane', lambda *_: np.zeros(3))
+        patch.setattr(stereo, 'under_floor', lambda *_: everywhere)
+        assert known() != looks
+
+
+def test_a_pair_is_fitted_to():
     """What is told of a patch is how far the parallax was found wrong."""
-    sequence = render_sequence('street', 1, 3, 480)
-    save_sequence([sequence[k] for k in range(3)], tmp_path / 'scene', 'street')
-    first, *_ = patches_of(tmp_path / 'scene', np.random.default_rng(0))
-    rows, columns = (4 * n for n in first.x.shape[1:])
-    assert first.x.shape[0] == CHANNELS
-    assert first.error.shape == first.weight.shape == (rows, columns)
-    assert np.median(np.abs(first.error[first.weight > 0])) < 0.15
+    sequence = render_sequence('street', 1, 2, 480)
+    patch = patch_of(sequence[1], sequence[0], 480, np.random.default_rng(0))
+    rows, columns = (4 * n for n in patch.x.shape[1:])
+    assert patch.x.shape[0] == CHANNELS
+    assert patch.error.shape == patch.weight.shape == (rows, columns)
+    assert np.median(np.abs(patch.error[patch.weight > 0])) < 0.15
