@@ -16,7 +16,7 @@ from sphstereo_ros.bench.obstacles import frames_of_bag
 from sphstereo_ros.core import match_judge, stereo
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import AlignedWindow, Reference, RelativePose
-from sphstereo_ros.core.match_judge import CHANNELS, TAIL, inputs, judged_matcher
+from sphstereo_ros.core.match_judge import CHANNELS, TAIL, inputs, judged_matcher, told
 from sphstereo_ros.core.matching import MARGIN, UNKNOWN, Parallax, stereo_grid
 from sphstereo_ros.core.reliability import LEAST
 from sphstereo_ros.core.stereo import SphericalStereo
@@ -81,6 +81,20 @@ def test_beyond_the_seam_comes_what_lies_there():
     np.testing.assert_array_equal(x[:, :ROUND + WRAP], x[:, inner:inner + ROUND + WRAP])
     assert not np.array_equal(x[:, :ROUND], x[:, ROUND:2 * ROUND])
     assert x.shape[1] % 16 == x.shape[2] % 16 == 0
+
+
+def test_each_output_tells_of_its_own_pixel(monkeypatch):
+    """Sixteen of a percentile, row by row, are four by four pixels at half size."""
+    x = np.zeros((1, CHANNELS, 2 * ROUND + 16, 16), np.float32)
+    rows, columns = (n // 2 for n in x.shape[2:])
+    out = np.arange(48 * rows * columns, dtype=np.float32).reshape(1, 48, rows, columns)
+    monkeypatch.setattr(match_judge, '_network', lambda: lambda _: out)
+    found = told(x, (64, 64))
+    assert found.shape == (3, 32, 32)
+    for percentile, row, column in ((0, 0, 0), (1, 5, 18), (2, 31, 30)):
+        part = 16 * percentile + 4 * (row % 4) + column % 4
+        assert found[percentile, row, column] == out[
+            0, part, (row + 2 * ROUND) // 4, column // 4]
 
 
 @settings(max_examples=20, deadline=None)
