@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.match_judge import BLOCK, CHANNELS, ROUND, inputs
@@ -28,7 +27,7 @@ from sphstereo_ros.scenes.sequence import TruthFrame, load_sequence, true_pose
 from .accuracy import as_frame
 from .processes import shipped
 from .reliability import MOST, PERCENTILES, disturbed, true_on_grid
-from .unet import Design, Parameters, percentile_loss, plain
+from .unet import Design, Parameters, fit_arguments, percentile_loss, save_fit
 
 # Pairs of a sequence (current frame, reference), and the rows that they are matched at.
 _PAIRS = ((3, 2), (3, 1), (2, 1))
@@ -128,15 +127,8 @@ def fit(patches: Sequence[Patch], steps: int, rng: np.random.Generator,
 def main() -> None:
     """Fit and save."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
-    parser.add_argument('out', type=Path)
-    parser.add_argument('folders', type=Path, nargs='+')
-    parser.add_argument('--steps', type=int, default=4000)
-    parser.add_argument('--start', type=Path, help='network to go on from')
-    args = parser.parse_args()
-    rng = np.random.default_rng(0)
-    patches = [p for f in tqdm(args.folders, unit='folder') for p in patches_of(f, rng)]
-    start = DESIGN.weights_of(args.start.read_bytes()) if args.start else None
-    args.out.write_bytes(DESIGN.as_onnx(plain(fit(patches, args.steps, rng, start))))
+    fit_arguments(parser, 4000)
+    save_fit(parser.parse_args(), DESIGN, patches_of, fit)
 
 
 if __name__ == '__main__':

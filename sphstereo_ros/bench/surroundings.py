@@ -35,7 +35,7 @@ from sphstereo_ros.scenes.sequence import (
 
 from .accuracy import as_frame
 from .reliability import MOST, PERCENTILES, Watched, disturbed
-from .unet import Design, Parameters, percentile_loss, plain
+from .unet import Design, Parameters, fit_arguments, percentile_loss, save_fit
 
 _SEEDS, _PAIR_SEEDS = range(11, 61), range(61, 81)
 _RENDERED = (1, 7, 10, 11)  # frames of a sequence
@@ -190,19 +190,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
     commands = parser.add_subparsers(dest='command', required=True)
     commands.add_parser('render').add_argument('folder', type=Path)
-    fitting = commands.add_parser('fit')
-    fitting.add_argument('out', type=Path)
-    fitting.add_argument('folders', type=Path, nargs='+')
-    fitting.add_argument('--steps', type=int, default=6000)
-    fitting.add_argument('--start', type=Path, help='network to go on from')
-    args = parser.parse_args()
-    if args.command == 'render':
-        render(args.folder)
-        return
-    rng = np.random.default_rng(0)
-    patches = [p for f in tqdm(args.folders, unit='folder') for p in patches_of(f, rng)]
-    start = DESIGN.weights_of(args.start.read_bytes()) if args.start else None
-    args.out.write_bytes(DESIGN.as_onnx(plain(fit(patches, args.steps, rng, start))))
+    fit_arguments(commands.add_parser('fit'), 6000)
+    given = parser.parse_args()
+    if given.command == 'render':
+        render(given.folder)
+    else:
+        save_fit(given, DESIGN, patches_of, fit)
 
 
 if __name__ == '__main__':

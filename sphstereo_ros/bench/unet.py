@@ -4,9 +4,11 @@ They need torch and onnx (extra `fit`); the package itself does without.
 """
 from __future__ import annotations
 
+import argparse
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,6 +17,7 @@ from tqdm import tqdm
 
 Parameters = dict[str, Any]  # name of a layer → weight and bias
 Node = TypeVar('Node')
+Patch = TypeVar('Patch')
 
 _LEAK = 0.1
 _RATE = 3e-3
@@ -172,6 +175,27 @@ class Design:
 def plain(parts: Parameters) -> dict[str, NDArray[np.float32]]:
     """Weights as arrays."""
     return {name: part.detach().numpy() for name, part in parts.items()}
+
+
+def fit_arguments(parser: argparse.ArgumentParser, steps: int) -> None:
+    """What every fit by command is told."""
+    parser.add_argument('out', type=Path)
+    parser.add_argument('folders', type=Path, nargs='+')
+    parser.add_argument('--steps', type=int, default=steps)
+    parser.add_argument('--start', type=Path, help='network to go on from')
+
+
+def save_fit(given: argparse.Namespace, design: Design,
+             patches_of: Callable[[Path, np.random.Generator], list[Patch]],
+             fit: Callable[..., Parameters]) -> None:
+    """Fit to the patches of all folders, and save: as `fit_arguments` were given.
+
+    fit : (patches, steps, rng, weights to start from or None) → weights
+    """
+    rng = np.random.default_rng(0)
+    patches = [p for f in tqdm(given.folders, unit='folder') for p in patches_of(f, rng)]
+    start = design.weights_of(given.start.read_bytes()) if given.start else None
+    given.out.write_bytes(design.as_onnx(plain(fit(patches, given.steps, rng, start))))
 
 
 def percentile_loss(told: Any, error: Any, weight: Any, least: float, most: float,
