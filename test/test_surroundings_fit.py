@@ -1,7 +1,6 @@
 """The network of what is round about, while it is fitted: runs where torch and onnx are."""
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 
@@ -11,18 +10,6 @@ from sphstereo_ros.core.surroundings import CHANNELS
 
 torch = pytest.importorskip('torch')
 pytest.importorskip('onnx')
-
-
-@pytest.mark.parametrize('shape', [(64, 64), (96, 32)])
-def test_opencv_runs_what_was_fitted(shape):
-    parts = DESIGN.begun(torch.Generator().manual_seed(1))
-    net = cv2.dnn.readNetFromONNX(np.frombuffer(DESIGN.as_onnx(plain(parts)), np.uint8))
-    x = np.random.default_rng(0).normal(size=(1, CHANNELS, *shape)).astype(np.float32)
-    net.setInput(x)
-    with torch.no_grad():
-        expected = DESIGN.forward(parts, torch.from_numpy(x)).numpy()
-    assert expected.shape == (1, len(DESIGN.begin), *shape)
-    np.testing.assert_allclose(net.forward(), expected, atol=1e-4)
 
 
 def test_a_network_that_was_saved_goes_on():

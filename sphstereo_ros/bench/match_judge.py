@@ -8,7 +8,7 @@ FOLDER holds a sequence that `sphstereo_ros.bench.surroundings render` made. Nee
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -118,10 +118,8 @@ def loss(out: Any, error: Any, weight: Any) -> Any:
 def fit(patches: Sequence[Patch], steps: int, rng: np.random.Generator,
         start: dict[str, NDArray[np.float32]] | None = None) -> Parameters:
     """Weights after so many steps, from `start` if there is one."""
-    def part(network: Callable[[Any], Any]) -> Any:
-        x, error, weight = _varied(patches[int(rng.integers(len(patches)))], rng)
-        return loss(network(x), error, weight)
-    return DESIGN.fitted(part, steps, _BATCH, start)
+    return DESIGN.fitted(lambda: _varied(patches[int(rng.integers(len(patches)))], rng), loss,
+                         steps, _BATCH, start)
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ class Convolutions:
         self._lock = threading.Lock()
 
     def __call__(self, x: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Outputs (1, outputs, rows, columns) of x (1, channels, rows, columns), as its own."""
+        """Outputs (1, outputs, rows, columns) of x (1, channels, rows, columns)."""
         with self._lock:  # a network of OpenCV holds what it computes
             self._net.setInput(x)
-            return np.array(self._net.forward())
+            return np.asarray(self._net.forward())
