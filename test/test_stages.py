@@ -516,9 +516,15 @@ def test_the_seam_is_matched_like_the_rest(matcher, columns):
     before_ = np.roll(relative_error(straight, seen()), -columns, axis=1)
     now = relative_error(turned, seen(turn=turn))
     rows = slice(HEIGHT // 6, -HEIGHT // 6)
+    # How much more is known, of every four columns: a network at a part of the size does not see
+    # every place alike.
+    change = (np.isfinite(now[rows]).mean(0) - known[rows].mean(0)).reshape(-1, 4).mean(1)
+    least = min(-0.05, np.quantile(change, 0.1))
+    assert least > -0.1
     # left and right of the seam, and where neither has it
-    for part in ((rows, slice(-4, None)), (rows, slice(0, 4)), (rows, slice(100, 104))):
-        assert np.isfinite(now[part]).mean() > known[part].mean() - 0.05
+    for first in (len(change) - 1, 0, 25):
+        part = rows, slice(4 * first, 4 * first + 4)
+        assert first == 25 or change[first] > least
         assert np.nanmedian(now[part]) < 1.5 * np.nanmedian(before_[part]) + 0.002
 
 

@@ -118,14 +118,20 @@ def _render_ways(folder: Path) -> None:
         jobs += [('takeoff', seed, None, None)] * (seed % 3 == 0 or seed > 25)
         jobs += [('corridor', seed, None, None)] * (seed % 5 == 0)
     for name, seed, step, nuisance in tqdm(jobs, unit='scene'):
-        target = folder / f'{name}_{seed}'
-        if target.exists():
-            continue
         height = 960 if name != 'corridor' and seed % 3 else 480
-        sequence = render_sequence(name, seed, 14, height, spacing=step, nuisance=nuisance)
-        frames: list[TruthFrame] = [sequence[k] for k in _RENDERED]
-        save_sequence(frames, target.with_suffix('.part'), name)
-        target.with_suffix('.part').rename(target)
+        render_way(folder, name, seed, height, step, nuisance)
+
+
+def render_way(folder: Path, name: str, seed: int, height: int, spacing: float | None,
+               nuisance: str | None) -> None:
+    """Four frames of a way, in a folder of their own, unless they are there."""
+    target = folder / f'{name}_{seed}'
+    if target.exists():
+        return
+    sequence = render_sequence(name, seed, 14, height, spacing=spacing, nuisance=nuisance)
+    frames: list[TruthFrame] = [sequence[k] for k in _RENDERED]
+    save_sequence(frames, target.with_suffix('.part'), name)
+    target.with_suffix('.part').rename(target)
 
 
 def _render_pairs(folder: Path) -> None:

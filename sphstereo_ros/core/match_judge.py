@@ -1,9 +1,11 @@
-"""How far the match of one pair errs, told from what is round about: for small computers.
+"""How far the match of one pair errs, and what it misses, told from what is round about: for
+small computers.
 
-Block matching finds something everywhere: on blank walls, beside rims, in the sky between leaves.
-What a match looks like by itself does not tell, the shape of what is round about does. A
+Block matching finds something wrong, or nothing, on blank walls, beside rims, in the sky between
+leaves. What a match looks like by itself does not tell, the shape of what is round about does. A
 convolutional network sees parallax, grey, and what the reference shows where the match lies, at a
-quarter of the size; for each pixel at half size it tells percentiles of the parallax's error.
+quarter of the size; for each pixel at half size it tells percentiles of the parallax's error, and
+completes: the parallax that what is round about suggests, with percentiles of its error, too.
 It was fitted to rendered scenes with exact range (`sphstereo_ros.bench.match_judge`).
 """
 from __future__ import annotations
@@ -21,13 +23,15 @@ from .reliability import LEAST, logarithms
 from .warp import Map
 
 CHANNELS = 20
-BLOCK = 16  # px at a quarter of the size: what the network halves four times
+_TOLD = 7  # outputs for each pixel at half size
+BLOCK = 32  # px at a quarter of the size: what the network halves five times
 _FINER = 4  # px at half size, each way, that the network tells of by one of its own
-ROUND = 16  # px at a quarter of the size that it sees beyond the seam
+ROUND = 32  # px at a quarter of the size that it sees beyond the seam
 _LOGARITHMS = (0, 1, 2, 3, 12, 13, 14, 15, 16, 17)  # of the inputs
 # Of the unit: a likely error with which a match stands, and what may be nearer with which not.
 _SURE, _NEARER = 0.25, 0.25
 _NEAR = 1 / 40  # rad at right angles to the motion: nearer than that matters (40 baselines)
+_CONTRADICTS = 6.0  # grey levels by which the reference differs from what was completed
 TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
 
 
@@ -135,44 +139,92 @@ def _network() -> Convolutions:
     return Convolutions('match_judge.onnx')
 
 
+@fast_kernel
+def _spread_rows(first: int, last: int, out: NDArray[np.float32],
+                 whole: NDArray[np.float32]) -> None:  # pragma: no cover - compiled
+    """Rows of `whole` from the network's outputs: of a kind sixteen, of four by four pixels."""
+    for k in range(_TOLD):
+        for i in range(first, last):
+            kind, row = _FINER * (_FINER * k + i % _FINER), (i + 2 * ROUND) // _FINER
+            for j in range(whole.shape[2]):
+                whole[k, i, j] = out[kind + j % _FINER, row, j // _FINER]
+
+
 def told(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """The network's outputs, float32 (3, rows // 2, columns // 2) of the grid's `shape`:
+    """The network's outputs, float32 (7, rows // 2, columns // 2) of the grid's `shape`:
     logarithms of the 68th and 95th percentile of the parallax's error, and of the 98th of how much
-    larger it may be, as a share of the parallax (at least of a pixel), with LEAST added.
+    larger it may be, as a share of the parallax (at least of a pixel), with LEAST added; the
+    logarithm of the completed parallax and half a pixel; and the same three of its error.
     """
-    out = _network()(x)[0]
-    parts = out.reshape(3, _FINER, _FINER, *out.shape[1:]).transpose(0, 3, 1, 4, 2)
-    whole = parts.reshape(3, _FINER * out.shape[1], _FINER * out.shape[2])
-    first = 2 * ROUND
-    return np.ascontiguousarray(whole[:, first:first + shape[0] // 2, :shape[1] // 2])
+    whole = np.empty((_TOLD, shape[0] // 2, shape[1] // 2), np.float32)
+    rows_in_parallel(_spread_rows, whole.shape[1], _network()(x)[0], whole)
+    return whole
 
 
 @fast_kernel
-def _judge_rows(first: int, last: int, told: NDArray[np.float32], sine: Map, near: np.float32,
-                tail: np.float32, sigma: Map, pixels: Map) -> None:  # pragma: no cover - compiled
-    """`sigma` (at half size) is what is told, and `pixels` are UNKNOWN where that is too much."""
+def _likely(told: NDArray[np.float32], k: int, i: int, j: int,
+            tail: np.float32) -> np.float32:  # pragma: no cover - compiled
+    """Standard deviation as a share, from percentiles k and k + 1."""
+    least = np.float32(LEAST)
+    return max(max(np.exp(told[k, i, j]) - least, (np.exp(told[k + 1, i, j]) - least) * tail),
+               np.float32(0))
+
+
+@fast_kernel
+def _stands(pixels: np.float32, likely: np.float32, nearer: np.float32,
+            near: np.float32) -> bool:  # pragma: no cover - compiled
+    """Whether so many are right as a rule, and nothing near is missed."""
+    hides = nearer > np.float32(_NEARER) and (
+        pixels + nearer * max(pixels, np.float32(1)) > near)
+    return bool(pixels != np.float32(UNKNOWN) and likely <= np.float32(_SURE) and not hides)
+
+
+@fast_kernel
+def _shows_the_same(current: Image8, reference: Image8, r: int, c: int,
+                    pixels: np.float32) -> bool:  # pragma: no cover - compiled
+    """Whether the reference does not contradict such a parallax."""
+    end = np.float32(current.shape[1] - 1.001)
+    at = min(max(np.float32(c) - pixels, np.float32(0)), end)
+    left = np.int32(at)
+    share = at - np.float32(left)
+    there = (np.float32(reference[r, left]) * (np.float32(1) - share)
+             + np.float32(reference[r, left + 1]) * share)
+    return bool(abs(np.float32(current[r, c]) - there) <= np.float32(_CONTRADICTS))
+
+
+@fast_kernel
+def _judge_rows(first: int, last: int, current: Image8, reference: Image8,
+                told: NDArray[np.float32], sine: Map, near: np.float32, tail: np.float32,
+                sigma: Map, pixels: Map) -> None:  # pragma: no cover - compiled
+    """`pixels` become what was found, or completed where that is likelier, or UNKNOWN where both
+    are too uncertain; `sigma` (at half size) is what is told of them.
+    """
     unknown, least, one = np.float32(UNKNOWN), np.float32(LEAST), np.float32(1)
     for i in range(first, last):
         for j in range(sigma.shape[1]):
-            likely = max(max(np.exp(told[0, i, j]) - least,
-                             (np.exp(told[1, i, j]) - least) * tail), np.float32(0))
-            nearer = np.exp(told[2, i, j]) - least
-            unit = np.float32(0)
+            likely, likely_completed = _likely(told, 0, i, j, tail), _likely(told, 4, i, j, tail)
+            nearer, nearer_completed = np.exp(told[2, i, j]) - least, np.exp(told[6, i, j]) - least
+            completed = max(np.exp(told[3, i, j]) - np.float32(0.5), np.float32(0.01))
+            widest = np.float32(0.02)
             for k in range(4):
                 r, c = 2 * i + (k >> 1), 2 * j + (k & 1)
-                d = pixels[r, c]
-                size = max(d, one)
-                hides = nearer > np.float32(_NEARER) and (
-                    d + nearer * size > near * sine[c])
-                if d == unknown or likely > np.float32(_SURE) or hides:
-                    pixels[r, c] = unknown
+                d, bound = pixels[r, c], near * sine[c]
+                found = _stands(d, likely, nearer, bound)
+                other = _stands(completed, likely_completed, nearer_completed, bound) and (
+                    _shows_the_same(current, reference, r, c, completed))
+                if other and (not found or likely_completed * max(completed, one)
+                              < likely * max(d, one)):
+                    pixels[r, c] = completed
+                    widest = max(widest, likely_completed * max(completed, one))
+                elif found:
+                    widest = max(widest, likely * max(d, one))
                 else:
-                    unit = max(unit, size)
-            sigma[i, j] = max(likely * max(unit, one), np.float32(0.02))
+                    pixels[r, c] = unknown
+            sigma[i, j] = widest
 
 
 def judged_matcher(match: Matcher) -> Matcher:
-    """`match`, of which only stands what is right as a rule, with the error that it has then.
+    """`match`, completed, of which only stands what is right as a rule, with its error.
 
     The views' sizes are multiples of four, with MARGIN round about.
     """
@@ -180,9 +232,9 @@ def judged_matcher(match: Matcher) -> Matcher:
         found = match(current, reference)
         shape, pixel = current.shape, np.pi / (current.shape[1] - 2 * MARGIN)
         errors = told(inputs(current, reference, found), shape)
-        rows_in_parallel(_judge_rows, len(found.sigma), errors, _sine(shape[1]),
-                         np.float32(_NEAR / pixel), np.float32(np.exp(-TAIL)), found.sigma,
-                         found.pixels)
+        rows_in_parallel(_judge_rows, len(found.sigma), current, reference, errors,
+                         _sine(shape[1]), np.float32(_NEAR / pixel), np.float32(np.exp(-TAIL)),
+                         found.sigma, found.pixels)
         return found
 
     return judged
