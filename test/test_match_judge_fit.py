@@ -21,7 +21,7 @@ def test_a_fit_tells_small_errors_from_large_ones_and_completes():
     sigma = np.where(np.arange(256) < 128, 0.02, 0.2)[None]
     found = (true / (1 + sigma * rng.normal(size=true.shape))).clip(0, 99)
     parts = fit([Patch(x, *(m.astype(np.float16) for m in (found, true, np.ones_like(true))))],
-                200, rng)
+                300, rng)
     with torch.no_grad():
         out = DESIGN.forward(parts, torch.from_numpy(x.astype(np.float32))[None]).numpy()[0]
     told = np.exp(out[:16].mean(0))
@@ -30,5 +30,5 @@ def test_a_fit_tells_small_errors_from_large_ones_and_completes():
     assert large == pytest.approx(0.2, rel=0.5)
     completed = out[48:64].reshape(4, 4, 32, 32).transpose(2, 0, 3, 1).reshape(128, 128)
     off = np.abs(completed - np.log(0.5 + true[::2, ::2]))
-    assert np.median(off) < 0.1
+    assert np.median(off) < 0.15  # a guess would be off by 0.5
     assert np.exp(np.median(out[64:80])) == pytest.approx(np.quantile(off, 0.683), rel=0.6)
