@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from sphstereo_ros.bench.reliability import HIDDEN, Fit, Samples, fit
 from sphstereo_ros.core import judgement
+from sphstereo_ros.core.alternatives import Alternatives
 from sphstereo_ros.core.judgement import Found, by_looks
 from sphstereo_ros.core.matching import UNKNOWN, Parallax, stereo_grid
 from sphstereo_ros.core.refinement import Refined
@@ -40,6 +41,12 @@ def found(rng: np.random.Generator, scale: float = 1.0):
     refined = Refined((rho / scale).astype(np.float32), information.astype(np.float32), misfit)
     return (view, refined, (other / scale).astype(np.float32), matched,
             Parallax(np.zeros(shape, np.float32), half, signed=True))
+
+
+def others_of(refined: Refined) -> Alternatives:
+    """To what was measured, as differ from place to place as that."""
+    rho, misfit = refined.rho, refined.misfit / 5
+    return Alternatives(0.3 * misfit, 1.1 * misfit, rho * 1.6, 0.9 * misfit, rho * 0.4, misfit)
 
 
 def everywhere() -> tuple[np.ndarray, np.ndarray]:
@@ -171,7 +178,10 @@ def test_what_is_told_decides_for_how_much_it_counts(monkeypatch, likely, nearer
     view, _, _, matched, parallax = found(np.random.default_rng(0))
     refined = Refined(rho, np.full(shape, 1e9, np.float32), np.full(shape, misfit, np.float32))
     monkeypatch.setattr(judgement, 'percentiles', lambda *_: (told(own), rho))
-    monkeypatch.setattr(judgement, 'judged', lambda *_: told(likely))
-    judged = by_looks(Found(view, refined, rho, matched, parallax), GRID, baselines)
+    monkeypatch.setattr(judgement, 'judged', lambda *_: np.concatenate([
+        told(likely), np.ones((1, *shape), np.float32), told(9)]))  # nothing is completed
+    judged = by_looks(Found(view, view, view, refined, rho, matched, parallax),
+                      others_of(refined), GRID, baselines)
+    np.testing.assert_array_equal(judged.rho, rho)
     assert (judged.frames == frames).all()
     np.testing.assert_allclose(judged.error, likely * rho, rtol=1e-2)

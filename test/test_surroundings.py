@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_reliability import BASELINES, GRID, found
+from test_reliability import BASELINES, GRID, found, others_of
 
 from sphstereo_ros.bench.accuracy import as_frame
 from sphstereo_ros.bench.obstacles import frames_of_bag
@@ -21,7 +21,7 @@ from sphstereo_ros.core.judgement import together
 from sphstereo_ros.core.matching import UNKNOWN, matcher
 from sphstereo_ros.core.refinement import Refined
 from sphstereo_ros.core.reliability import look, network, percentiles
-from sphstereo_ros.core.surroundings import CHANNELS, inputs, judged
+from sphstereo_ros.core.surroundings import CHANNELS, completed, inputs, judged
 from sphstereo_ros.scenes.binocular import render_binocular, save_binocular
 from sphstereo_ros.scenes.sequence import true_pose
 
@@ -32,7 +32,8 @@ def seen_at(parts, baselines=BASELINES):
     view, refined, other, matched, parallax = parts
     seen = look(view, refined, other, matched, parallax)
     told, unit = percentiles(seen, GRID, baselines, network())
-    return inputs(view, seen, told, unit, GRID, baselines), seen, told, unit
+    return (inputs(view, seen, others_of(refined), told, unit, GRID, baselines), seen, told,
+            unit)
 
 
 def mean(block) -> float:
@@ -49,6 +50,10 @@ def test_the_inputs_of_a_pixel(h, w):
     sine = np.maximum(np.abs(np.sin(theta)), 0.02)[None] * np.ones((2, 1))
     rho, units, grey = refined.rho[block], unit[block], (view[block] / 64.0 - 2)
     known = matched[block] != UNKNOWN
+    others = others_of(refined)
+
+    def grey_of(difference):
+        return np.log(2 + difference[block].ravel()) - 2
     short, long = (units * b * sine / GRID.pixel for b in BASELINES)
     exact = [*np.maximum(told[0], told[1] - 1.3)[block].ravel(), mean(told[2][block]),
              *np.log(0.1 + short).ravel(), mean(np.clip(rho / units, -1, 1)), *grey.ravel(),
@@ -59,7 +64,10 @@ def test_the_inputs_of_a_pixel(h, w):
              0.7 * (np.log(4 + mean(refined.misfit[block])) - 3),
              0.2 * np.log(0.01 + mean(refined.information[block] * units**2)),
              0.5 * np.log(0.1 + mean(long)), mean(sine), np.ptp(grey),
-             np.log(0.05 + seen.half[13, h, w]) + 1]
+             np.log(0.05 + seen.half[13, h, w]) + 1,
+             *grey_of(others.least), *grey_of(others.most), *grey_of(others.near_least),
+             np.log(1.1 + min(others.near[2 * h, 2 * w] / units[0, 0], 20)),
+             *grey_of(others.far_least), np.log(1.1 + others.far[2 * h, 2 * w] / units[0, 0])]
     assert len(exact) == CHANNELS
     np.testing.assert_allclose(out[0, :, ROUND + h, w], exact, rtol=1e-4, atol=1e-4)
 
@@ -77,7 +85,7 @@ def test_sizes_halve_evenly():
     out, seen, told, _ = seen_at(found(np.random.default_rng(3)))
     assert out.shape[2] % BLOCK == out.shape[3] % BLOCK == 0
     assert out.shape[2] >= seen.half.shape[1] + 2 * ROUND
-    assert judged(out, GRID.shape).shape == told.shape
+    assert judged(out, GRID.shape).shape == (7, *told.shape[1:])
 
 
 @settings(max_examples=8, deadline=None)
@@ -116,6 +124,21 @@ def test_a_view_that_is_turned_is_judged_as_before():
 
 
 @settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1000), st.floats(0.01, 100))
+def test_what_is_completed_is_as_much_larger_as_told(seed, scale):
+    """The network tells by how much the logarithm of the shortest baseline's parallax, and a tenth
+    of a pixel, is larger than where the unit was measured.
+    """
+    rng, baselines = np.random.default_rng(seed), [scale * b for b in BASELINES]
+    unit, true = (rng.uniform(0.01, 2, GRID.shape).astype(np.float32) / scale for _ in range(2))
+    pixel = GRID.pixel / np.maximum(np.abs(np.sin(GRID.theta())), 0.02)
+    measured, wanted = (np.log(0.1 + m * min(baselines) / pixel) for m in (unit, true))
+    rho, its_unit = completed((wanted - measured).astype(np.float32), unit, GRID, baselines)
+    np.testing.assert_allclose(rho, true, rtol=1e-3, atol=1e-4 / scale)
+    np.testing.assert_allclose(its_unit, np.maximum(rho, pixel / max(baselines)), rtol=1e-5)
+
+
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 1000))
 def test_what_is_round_about_may_refuse_but_not_believe_alone(seed):
     own, wider = np.random.default_rng(seed).normal(size=(2, 3, 4, 5)).astype(np.float32)
@@ -128,7 +151,7 @@ def test_what_is_round_about_may_refuse_but_not_believe_alone(seed):
 def test_noise_is_not_believed():
     """Ranges without any rhyme: an error of a fifth at least is told of nearly all."""
     out, _, told, _ = seen_at(found(np.random.default_rng(5)))
-    assert np.mean(together(told, judged(out, GRID.shape))[0] > np.log(0.2)) > 0.9
+    assert np.mean(together(told, judged(out, GRID.shape)[:3])[0] > np.log(0.2)) > 0.9
 
 
 @pytest.mark.parametrize(('references', 'least'), [(3, 0.85), (1, 0.8)])
@@ -151,7 +174,8 @@ def test_sky_behind_leaves_is_refused(monkeypatch, references, least):
     ghosts, known = believed()
     assert known > least
     # A network that believes everything leaves the decision to what a pixel tells by itself.
-    monkeypatch.setattr(judgement, 'judged', lambda x, shape: np.full((3, *shape), -9.0, 'f4'))
+    monkeypatch.setattr(judgement, 'judged', lambda x, shape: np.broadcast_to(
+        np.float32([-9, -9, -9, 0, 9, 9, 9])[:, None, None], (7, *shape)))
     alone, _ = believed()
     assert ghosts < 0.25 * alone
 
@@ -162,6 +186,6 @@ def test_a_pair_of_cameras_is_fitted_to(tmp_path):
     patch, = patches_of(tmp_path, np.random.default_rng(0))
     rows, columns = (2 * n for n in patch.x.shape[1:])
     assert patch.x.shape[0] == CHANNELS
-    assert patch.error.shape == patch.weight.shape == (rows, columns)
+    assert patch.error.shape == patch.true.shape == patch.weight.shape == (rows, columns)
     assert 0.9 < np.mean(patch.weight > 0) <= 1
     assert np.median(np.abs(patch.error[patch.weight > 0])) < 0.1

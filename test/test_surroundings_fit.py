@@ -12,13 +12,19 @@ torch = pytest.importorskip('torch')
 pytest.importorskip('onnx')
 
 
+def patch_of(x: np.ndarray, error: np.ndarray) -> Patch:
+    """Of inputs and errors; the true parallax has the logarithm 1."""
+    error = error.astype(np.float16)
+    return Patch(x.astype(np.float16), error, np.ones_like(error), np.ones_like(error), 1.0)
+
+
 def test_a_network_that_was_saved_goes_on():
     parts = plain(DESIGN.begun(torch.Generator().manual_seed(1)))
     found = DESIGN.weights_of(DESIGN.as_onnx(parts))
     assert found.keys() == parts.keys()
     x = np.zeros((CHANNELS, 64, 64), np.float16)
     nothing = np.zeros((128, 128), np.float32)
-    same = plain(fit([Patch(x, nothing, nothing + 1)], 0, np.random.default_rng(0), found))
+    same = plain(fit([patch_of(x, nothing)], 0, np.random.default_rng(0), found))
     for name, value in parts.items():
         np.testing.assert_array_equal(same[name], value)
 
@@ -30,7 +36,7 @@ def test_a_fit_tells_small_errors_from_large_ones():
     x[22, :, 32:] += 1
     sigma = np.where(np.arange(128) < 64, 0.02, 0.2)[None] * np.ones((128, 1))
     error = (sigma * rng.normal(size=(128, 128))).astype(np.float32)
-    parts = fit([Patch(x.astype(np.float16), error, np.ones_like(error))], 60, rng)
+    parts = fit([patch_of(x, error)], 60, rng)
     with torch.no_grad():
         out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
     told = np.exp(out[:4].mean(0))
@@ -39,12 +45,28 @@ def test_a_fit_tells_small_errors_from_large_ones():
     assert large == pytest.approx(0.2, rel=0.5)
 
 
+def test_a_fit_completes():
+    """Parallax that grey tells, and what was measured does not."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(0, 0.1, (CHANNELS, 64, 64)).astype(np.float32)
+    x[5:9], x[10:14, :, 32:] = 0, 1  # logarithm of what was measured; grey
+    true = np.where(np.arange(128) < 64, 0.5, 1.5)[None] * np.ones((128, 1))
+    maps = [m.astype(np.float16) for m in (0 * true, true, 1 + 0 * true)]
+    parts = fit([Patch(x.astype(np.float16), *maps, 1.0)], 120, rng)
+    with torch.no_grad():
+        out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
+    larger, likely = out[12:16].mean(0), np.exp(out[16:20].mean(0))
+    assert np.median(np.abs(larger[:, 4:28] - 0.5)) < 0.1
+    assert np.median(np.abs(larger[:, 36:60] - 1.5)) < 0.1
+    assert np.median(likely) < 0.2
+
+
 def test_one_that_saw_less_goes_on():
     parts = plain(DESIGN.begun(torch.Generator().manual_seed(1)))
     narrow = {name: value[:, :-5] if name == 'enter.weight' else value
               for name, value in parts.items()}
     nothing = np.zeros((128, 128), np.float32)
     x = np.zeros((CHANNELS, 64, 64), np.float16)
-    wide = plain(fit([Patch(x, nothing, nothing + 1)], 0, np.random.default_rng(0), narrow))
+    wide = plain(fit([patch_of(x, nothing)], 0, np.random.default_rng(0), narrow))
     assert wide['enter.weight'].shape == parts['enter.weight'].shape
     np.testing.assert_array_equal(wide['enter.weight'][:, :-5], narrow['enter.weight'])

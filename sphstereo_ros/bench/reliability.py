@@ -90,7 +90,7 @@ class Watched(JointMatcher):
         seen = look(found.view, found.refined, found.other, found.matched, found.parallax)
         self.watch(found, seen, grid, axes, [p.baseline for _, p in pairs])
         nothing = np.zeros_like(found.refined.rho)
-        return Judged(found.other, nothing, nothing.astype(np.int8))
+        return Judged(found.refined.rho, found.other, nothing, nothing.astype(np.int8))
 
     def true(self, grid: PolarGrid, axes: NDArray[np.float64], rows: NDArray[np.int64],
              columns: NDArray[np.int64]) -> Floats:

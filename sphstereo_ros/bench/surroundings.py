@@ -19,10 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from sphstereo_ros.core.frames import Reference
-from sphstereo_ros.core.judgement import Found
+from sphstereo_ros.core.alternatives import Alternatives, alternatives
+from sphstereo_ros.core.frames import Image8, Reference, RelativePose
+from sphstereo_ros.core.judgement import Found, Judged
+from sphstereo_ros.core.refinement import JointRefinement
 from sphstereo_ros.core.reliability import LEAST, Look, network, percentiles
-from sphstereo_ros.core.surroundings import BLOCK, CHANNELS, inputs, interior
+from sphstereo_ros.core.surroundings import ADDED, BLOCK, CHANNELS, inputs, interior
 from sphstereo_ros.core.warp import PolarGrid
 from sphstereo_ros.scenes.binocular import TopCamera, render_binocular, save_binocular
 from sphstereo_ros.scenes.sequence import (
@@ -49,43 +51,62 @@ _RARE, _TOO_FAR = 2.0, 2.0
 _WIDTHS = (16, 32, 48, 64, 64, 64)  # channels at half size, a quarter, …
 _LAST = 32
 _BEGIN = -2.3  # logarithm of the error that it starts from
-_ROWS, _BATCH = 192, 3
+_ROWS, _COLUMNS, _BATCH, _RATE = 192, 256, 3, 1e-3
+_TRUE = 0.02  # share of a sample of which the truth has to be known
+_LARGE, _OFTEN = 600, 0.5  # rows at half size of a patch that is drawn so often at least
 
-
-DESIGN = Design(CHANNELS, _WIDTHS, _LAST, [_BEGIN] * (4 * len(PERCENTILES)))
+_TOLD = len(PERCENTILES)
+DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
+                [_BEGIN] * (4 * _TOLD) + [0.0] * 4 + [_BEGIN] * (4 * _TOLD))
 
 
 @dataclass(frozen=True)
 class Patch:
     """What the network sees of a window and should tell, of its polar grid without margins beyond.
 
-    x : float16 (CHANNELS, rows, columns); error : float32 (2 rows, 2 columns), true less measured
-    inverse range in units; weight : the same shape, 0 where the truth is unknown
+    x : float16 (CHANNELS, rows, columns); error : float16 (2 rows, 2 columns), true less measured
+    inverse range in units; true : the same shape, logarithm of the shortest baseline's parallax
+    and ADDED; weight : the same, 0 where the truth is unknown; ratio : of the shortest baseline to
+    the longest
     """
 
     x: NDArray[np.float16]
-    error: NDArray[np.float32]
-    weight: NDArray[np.float32]
+    error: NDArray[np.float16]
+    true: NDArray[np.float16]
+    weight: NDArray[np.float16]
+    ratio: float
 
 
 class _Kept(Watched):
     """Keeps a window's patch."""
 
     patch: Patch | None = None
+    _others: Alternatives
+
+    def _judged(self, found: Found, grid: PolarGrid, axes: NDArray[np.float64],
+                pairs: Sequence[tuple[Image8, RelativePose]]) -> Judged:
+        self._others = alternatives(found.refined.rho,
+                                    JointRefinement(found.view, grid, axes, pairs))
+        return super()._judged(found, grid, axes, pairs)
 
     def watch(self, found: Found, seen: Look, grid: PolarGrid, axes: NDArray[np.float64],
               baselines: Sequence[float]) -> None:
         rho = found.refined.rho
         told, unit = percentiles(seen, grid, baselines, network())
-        x = interior(inputs(found.view, seen, told, unit, grid, baselines), grid.shape)
+        x = interior(inputs(found.view, seen, self._others, told, unit, grid, baselines),
+                     grid.shape)
         true = self.true(grid, axes, *(n.ravel() for n in np.indices(grid.shape)))
         true = true.reshape(grid.shape)
         error = (true - rho) / unit
-        weight = np.isfinite(error) * np.maximum(np.sin(grid.theta()), 0.02)[None]
+        sine = np.maximum(np.sin(grid.theta()), 0.02)[None]
+        weight = np.isfinite(error) * sine
         weight *= np.where((true > 0.01) & (true < 0.1), _RARE, 1)
         weight *= np.where((true > 0.1) & (rho < true / 1.5), _TOO_FAR, 1)
-        self.patch = Patch(x[0].astype(np.float16), np.nan_to_num(error).astype(np.float32),
-                           weight.astype(np.float32))
+        pixels = np.nan_to_num(true) * sine * min(baselines) / grid.pixel
+        self.patch = Patch(x[0].astype(np.float16),
+                           np.clip(np.nan_to_num(error), -99, 99).astype(np.float16),
+                           np.log(ADDED + pixels).astype(np.float16), weight.astype(np.float16),
+                           min(baselines) / max(baselines))
 
 
 def patches_of(folder: Path, rng: np.random.Generator) -> list[Patch]:
@@ -150,43 +171,73 @@ def _render_pairs(folder: Path) -> None:
         target.with_suffix('.part').rename(target)
 
 
-def loss(out: Any, error: Any, weight: Any) -> Any:
-    """Of the percentiles of each pixel."""
+def loss(out: Any, measured: Any, error: Any, true: Any, weight: Any, ratio: float) -> Any:
+    """Of the percentiles of each pixel, of what was measured and of what is completed, and of that
+    itself.
+    """
+    import torch
     from torch.nn import functional
-    return percentile_loss(functional.pixel_shuffle(out, 2), error, weight, LEAST, MOST,
-                           PERCENTILES)
+    told = functional.pixel_shuffle(out, 2)
+    completed = told[:, _TOLD:_TOLD + 1] + measured
+    pixels = torch.exp(completed.detach()) - float(ADDED)
+    off = (torch.exp(true) - float(ADDED) - pixels) / pixels.clamp(min=ratio)
+
+    def of(percentiles: Any, error: Any) -> Any:
+        return percentile_loss(percentiles, error, weight, LEAST, MOST, PERCENTILES)
+    return (of(told[:, :_TOLD], error) + of(told[:, _TOLD + 1:], off)
+            + (weight * (true - completed).abs()).sum() / weight.sum())
 
 
-def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, Any, Any]:
+def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, ...]:
     """A part of a patch, in another light or mirrored."""
     import torch
-    columns = patch.x.shape[2]
-    height = min(_ROWS, patch.x.shape[1] // BLOCK * BLOCK)
-    first = int(rng.integers(0, patch.x.shape[1] - height + 1))
-    beyond = -columns % BLOCK
-    part = np.pad(patch.x[:, first:first + height], ((0, 0), (0, 0), (0, beyond)), 'edge')
-    x = torch.from_numpy(part.astype(np.float32))[None]
-    rows = slice(2 * first, 2 * (first + height))
-    error, weight = (torch.from_numpy(np.pad(m[rows].astype(np.float32), (
-        (0, 0), (0, 2 * beyond))))[None, None] for m in (patch.error, patch.weight))
+    from torch.nn import functional
+    x, maps = _part(patch, rng)
     gain, offset = float(np.exp(rng.normal(0, 0.25))), float(rng.normal(0, 0.3))
     x[:, 10:14] = (x[:, 10:14] * gain + offset).clamp(-2, 2)
     x[:, 23] *= gain
     x[:, 14] = torch.log(0.5 + gain * (torch.exp(x[:, 14] + 1) - 0.5).clamp(min=0)) - 1
+    for at in (25, 29, 33, 38):
+        x[:, at:at + 4] = torch.log(2 + gain * (torch.exp(x[:, at:at + 4] + 2) - 2)) - 2
     if rng.random() < 0.15:
         x[:, 10:14] *= -1
     if rng.random() < 0.5:
-        x, error, weight = (torch.flip(m, [2]) for m in (x, error, weight))
-        for at in (0, 5, 10):
+        x, *maps = (torch.flip(m, [2]) for m in (x, *maps))
+        for at in (0, 5, 10, 25, 29, 33, 38):
             x[:, at:at + 4] = x[:, at:at + 4][:, [2, 3, 0, 1]]
-    return x, error, weight
+    return x, functional.pixel_shuffle(x[:, 5:9], 2), *maps, patch.ratio
+
+
+def _part(patch: Patch, rng: np.random.Generator) -> tuple[Any, list[Any]]:
+    """Inputs, and error, truth and weight, of a part of a patch; beyond its end as at the end."""
+    import torch
+    rows, columns = patch.x.shape[1:]
+    height, width = min(_ROWS, rows // BLOCK * BLOCK), min(_COLUMNS, columns)
+    top, left = (int(rng.integers(0, n + 1)) for n in (rows - height, columns - width))
+    beyond = -width % BLOCK
+    part = np.pad(patch.x[:, top:top + height, left:left + width],
+                  ((0, 0), (0, 0), (0, beyond)), 'edge')
+    at = np.s_[2 * top:2 * (top + height), 2 * left:2 * (left + width)]
+    maps = [np.pad(m[at].astype(np.float32), ((0, 0), (0, 2 * beyond)))
+            for m in (patch.error, patch.true, patch.weight)]
+    return (torch.from_numpy(part.astype(np.float32))[None],
+            [torch.from_numpy(m)[None, None] for m in maps])
+
+
+def _drawn(patches: Sequence[Patch], rng: np.random.Generator) -> tuple[Any, ...]:
+    """A sample; large pictures, which show more, are drawn more often."""
+    large = [p for p in patches if p.x.shape[1] > _LARGE]
+    while True:
+        among = large if large and rng.random() < _OFTEN else patches
+        sample = _varied(among[int(rng.integers(len(among)))], rng)
+        if float(sample[4].mean()) > _TRUE:
+            return sample
 
 
 def fit(patches: Sequence[Patch], steps: int, rng: np.random.Generator,
         start: dict[str, NDArray[np.float32]] | None = None) -> Parameters:
     """Weights after so many steps, from `start` if there is one."""
-    return DESIGN.fitted(lambda: _varied(patches[int(rng.integers(len(patches)))], rng), loss,
-                         steps, _BATCH, start)
+    return DESIGN.fitted(lambda: _drawn(patches, rng), loss, steps, _BATCH, start, _RATE)
 
 
 def main() -> None:

@@ -96,22 +96,24 @@ class Design:
         return self._walk(x, layer, bent, joined)
 
     def fitted(self, draw: Callable[[], tuple[Any, ...]], loss: Callable[..., Any], steps: int,
-               batch: int, start: dict[str, NDArray[np.float32]] | None = None) -> Parameters:
+               batch: int, start: dict[str, NDArray[np.float32]] | None = None,
+               rate: float = _RATE) -> Parameters:
         """Weights after so many steps of Adam (Kingma and Ba 2014), from `start` if there is one.
 
         draw : gives a sample: x, and what else the loss asks for; `batch` of them make a step
         loss : (outputs, what else was drawn) → how wrong they are
         start : one that saw and told less goes on, too
+        rate : of learning; of one that goes on with new outputs, 3e-3 diverged
         """
         import torch
         parts = self.begun(torch.Generator().manual_seed(0))
         for name, value in (start or {}).items():
             parts[name].data[tuple(slice(n) for n in value.shape)] = torch.from_numpy(value.copy())
-        adam = torch.optim.Adam(parts.values(), _RATE)
+        adam = torch.optim.Adam(parts.values(), rate)
         progress = tqdm(range(steps), unit='step')
         for number in progress:
             slower = 0.5 * (1 + np.cos(np.pi * number / steps)) + 0.002
-            adam.param_groups[0]['lr'] = _RATE * min(1, (number + 1) / _WARM) * slower
+            adam.param_groups[0]['lr'] = rate * min(1, (number + 1) / _WARM) * slower
             adam.zero_grad()
             total = 0.0
             for _ in range(batch):

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .alternatives import alternatives
 from .frames import UNSCALED, Frame, Image8, Reference, RelativePose
 from .guided_sweep import guided_sweep
 from .inverse_range import NOTHING, _grid_angles, _polar_row, pose_sigmas
@@ -188,7 +189,8 @@ class JointMatcher:
         axes = polar_axes(pairs[0][1].direction)
         view = np.asarray(resample(with_border(current.image),
                                    polar_map(grid, axes, current.image.shape)), np.uint8)
-        parallax = self._parallax(view, pairs[0], grid, axes)
+        before, now = self._alike(view, pairs[0], grid, axes)
+        parallax = self._parallax(now, before)
         matched = _nearness(parallax, grid, pairs[0][1].baseline)
         refined = self._refined(view, grid, axes, pairs, filled(matched))
         moving = off_meridian(parallax, refined.misfit, grid, axes, pairs[0][1], height)
@@ -198,29 +200,32 @@ class JointMatcher:
             refined = self._sharpened(view, grid, axes, pairs, refined)
         else:
             other = matched
-        found = Found(view, refined, other, matched, parallax)
+        found = Found(view, now, before, refined, other, matched, parallax)
         judged = self._judged(found, grid, axes, pairs)
         measured = self._on_sphere(refined, judged, grid, axes, pairs, height)
         return replace(measured, moving=moving)
 
     def _judged(self, found: Found, grid: PolarGrid, axes: Floats,
                 pairs: Sequence[tuple[Image8, RelativePose]]) -> Judged:
-        del axes
         if self._sweeps:
-            return by_looks(found, grid, [p.baseline for _, p in pairs])
+            others = alternatives(found.refined.rho,
+                                  JointRefinement(found.view, grid, axes, pairs))
+            return by_looks(found, others, grid, [p.baseline for _, p in pairs])
         return by_agreement(found, found.other, grid, pairs[0][1].baseline, swept=False)
 
     def _swept(self, pairs: Sequence[tuple[Image8, RelativePose]],
                ) -> list[tuple[Image8, RelativePose]]:
         return [p for p in pairs if p[1].baseline <= _SWEPT * pairs[0][1].baseline]
 
-    def _parallax(self, view: Image8, nearest: tuple[Image8, RelativePose], grid: PolarGrid,
-                  axes: Floats) -> Parallax:
+    def _alike(self, view: Image8, nearest: tuple[Image8, RelativePose], grid: PolarGrid,
+               axes: Floats) -> tuple[Image8, Image8]:
+        """The nearest reference's view on the grid and the current one, in one light."""
         image, pose = nearest
-        reference = np.asarray(resample(with_border(image), polar_map(
-            grid, pose.rotation.T @ axes, image.shape)), np.uint8)
-        reference, view = in_one_light(reference, view)
-        return self._first(view, reference)
+        return in_one_light(np.asarray(resample(with_border(image), polar_map(
+            grid, pose.rotation.T @ axes, image.shape)), np.uint8), view)
+
+    def _parallax(self, current: Image8, reference: Image8) -> Parallax:
+        return self._first(current, reference)
 
     def _refined(self, view: Image8, grid: PolarGrid, axes: Floats,
                  pairs: Sequence[tuple[Image8, RelativePose]], start: Map) -> Refined:
@@ -260,7 +265,7 @@ class JointMatcher:
         baselines = np.array([p.baseline for _, p in pairs], np.float32)
         ways = np.array([p.direction for _, p in pairs], np.float32)
         rows_in_parallel(_measure_rows, height, *_grid_angles(height),
-                         np.ascontiguousarray(axes, np.float32), at_pole, refined.rho,
+                         np.ascontiguousarray(axes, np.float32), at_pole, judged.rho,
                          judged.error, judged.frames, judged.other, baselines, ways, poses, noise,
                          rho, sigma, second, frames, told)
         return Measurement(rho, sigma, second, frames, told)

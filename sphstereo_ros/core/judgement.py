@@ -7,13 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .alternatives import Alternatives
 from .frames import Image8
+from .jit import fast_kernel, rows_in_parallel
 from .matching import Parallax
 from .refinement import Refined
-from .reliability import expected_error, look, may_be_near, network, percentiles
-from .surroundings import inputs, judged
+from .reliability import LEAST, NEAR_BY, expected_error, look, may_be_near, network, percentiles
+from .surroundings import completed, inputs, judged
 from .sweep import reduction
-from .warp import Map, PolarGrid
+from .warp import Map, PolarGrid, _arctan2
 
 Evidence = NDArray[np.int8]
 
@@ -26,6 +28,9 @@ _PLAIN = 0.3  # of the unit: with a smaller likely error it counts for two frame
 # is not believed either.
 _NEARER, _VEILED = 0.6, 1.2
 _TAIL = 0.75  # of what is published
+# What is completed counts with such a likely error, in its unit, where it is likelier than what
+# was measured; and not where the reference differs by so many grey levels.
+_SURE_COMPLETED, _LIKELIER, _CONTRADICTS = 0.2, 1.0, 6.0
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
 _AGREES, _LEVELS, _SLACK = 0.05, 0.75, 1.5
@@ -37,11 +42,14 @@ _FLOOR = 0.17  # px: no match beats that
 class Found:
     """What is known of a window on its polar grid, before it is judged.
 
-    view : the current view; refined : the measurement; other : second opinion, 1/m;
-    matched, parallax : what the nearest pair's matcher found, 1/m and px
+    view : the current view; now, before : it and the nearest reference's, in one light; refined :
+    the measurement; other : second opinion, 1/m; matched, parallax : what the nearest pair's
+    matcher found, 1/m and px
     """
 
     view: Image8
+    now: Image8
+    before: Image8
     refined: Refined
     other: Map
     matched: Map
@@ -50,33 +58,78 @@ class Found:
 
 @dataclass(frozen=True)
 class Judged:
-    """Second opinion and likely error (1/m) on the polar grid.
+    """Inverse range, second opinion and likely error (1/m) on the polar grid.
 
     frames : for how many frames of evidence it counts; 0 = it is not believed, −1 = nor should
     be what is remembered there
     floor : px that no match beats, if the error does not tell them
     """
 
+    rho: Map
     other: Map
     error: Map
     frames: Evidence
     floor: float = 0.0
 
 
-def by_looks(found: Found, grid: PolarGrid, baselines: Sequence[float]) -> Judged:
-    """What looks as here errs so much as a rule; baselines of the references in m."""
+def by_looks(found: Found, others: Alternatives, grid: PolarGrid,
+             baselines: Sequence[float]) -> Judged:
+    """What looks as here errs so much as a rule, and what is likelier there in its place.
+
+    others : to what was measured; baselines : of the references, m
+    """
     seen = look(found.view, found.refined, found.other, found.matched, found.parallax)
     own, unit = percentiles(seen, grid, baselines, network())
-    wider = judged(inputs(found.view, seen, own, unit, grid, baselines), grid.shape)
-    error = expected_error(wider, unit, found.refined, _TAIL)
+    wider = judged(inputs(found.view, seen, others, own, unit, grid, baselines), grid.shape)
+    error = expected_error(wider[:3], unit, found.refined, _TAIL)
     sure = found.refined.misfit < MISFIT
     sure &= expected_error(own, unit, found.refined) < np.float32(_SURE) * unit
-    told = together(own, wider)
+    told = together(own, wider[:3])
     likely = expected_error(told, unit, found.refined) / unit
     near = may_be_near(told, unit, found.refined.rho, min(baselines))
     sure &= (likely < np.float32(_SURE_BOTH)) & (near < np.float32(_NEARER))
     frames = sure.astype(np.int8) + (sure & (likely < np.float32(_PLAIN)))
-    return Judged(found.other, error, np.where(near < np.float32(_VEILED), frames, np.int8(-1)))
+    frames = np.where(near < np.float32(_VEILED), frames, np.int8(-1))
+    rho = found.refined.rho.copy()
+    guess = completed(wider[3], unit, grid, baselines)
+    scale = np.array([grid.pixel, min(baselines), np.exp(-_TAIL)], np.float32)
+    theta = grid.theta().astype(np.float32)
+    rows_in_parallel(_complete_rows, len(rho), found.now, found.before, wider[4:], *guess, theta,
+                     scale, rho, error, frames)
+    return Judged(rho, found.other, error, frames)
+
+
+@fast_kernel
+def _complete_rows(first: int, last: int, view: Image8, before: Image8,
+                   told: NDArray[np.float32], guess: Map, unit: Map, theta: Map, scale: Map,
+                   rho: Map, error: Map, frames: Evidence) -> None:  # pragma: no cover - compiled
+    """What was measured (rho, error, frames) becomes what is completed, where that is likelier.
+
+    scale : rad of a pixel, shortest baseline, share of the 95th percentile that is likely
+    """
+    least, end = np.float32(LEAST), np.float32(view.shape[1] - 1.001)
+    for i in range(first, last):
+        for j in range(rho.shape[1]):
+            likely = max(max(np.exp(told[0, i, j]) - least,
+                             (np.exp(told[1, i, j]) - least) * scale[2]), np.float32(0))
+            if likely > np.float32(_SURE_COMPLETED) or (
+                    frames[i, j] > 0
+                    and likely * unit[i, j] > np.float32(_LIKELIER) * error[i, j]):
+                continue
+            nearer, there = np.exp(told[2, i, j]), guess[i, j]
+            if nearer > np.float32(_NEARER) and (
+                    (there + nearer * unit[i, j]) * np.float32(NEAR_BY) * scale[1] > 1):
+                continue
+            moved = _arctan2(np.sin(theta[j]), np.cos(theta[j]) + there * scale[1])
+            pixels = (theta[j] - moved) / scale[0]
+            at = min(max(np.float32(j) - pixels, np.float32(0)), end)
+            left = np.int32(at)
+            share = at - np.float32(left)
+            grey = (np.float32(before[i, left]) * (1 - share)
+                    + np.float32(before[i, left + 1]) * share)
+            if abs(np.float32(view[i, j]) - grey) > np.float32(_CONTRADICTS):
+                continue
+            rho[i, j], error[i, j], frames[i, j] = there, likely * unit[i, j], np.int8(1)
 
 
 def together(own: NDArray[np.float32], wider: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -102,4 +155,4 @@ def by_agreement(found: Found, other: Map, grid: PolarGrid, baseline: float,
     information = np.maximum(found.refined.information, np.float32(1e-9))
     error = np.asarray(np.float32(DEPENDENT) / np.sqrt(information), np.float32)
     sure = (np.abs(rho - other) < allowed) & (found.refined.misfit < MISFIT)
-    return Judged(other, error, sure.astype(np.int8), _FLOOR)
+    return Judged(rho, other, error, sure.astype(np.int8), _FLOOR)

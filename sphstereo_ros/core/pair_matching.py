@@ -129,9 +129,8 @@ class PairMatcher(JointMatcher):
                ) -> list[tuple[Image8, RelativePose]]:
         return list(pairs[:1])
 
-    def _parallax(self, view: Image8, nearest: tuple[Image8, RelativePose], grid: PolarGrid,
-                  axes: Floats) -> Parallax:
-        self._found = super()._parallax(view, nearest, grid, axes)
+    def _parallax(self, current: Image8, reference: Image8) -> Parallax:
+        self._found = super()._parallax(current, reference)
         return self._found
 
     def _judged(self, found: Found, grid: PolarGrid, axes: Floats,

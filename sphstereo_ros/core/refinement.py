@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 
 _NOISE = 2.0  # grey levels, of the difference of two views beside what range explains
 _MOST = 400.0  # squared grey levels: a worse difference tells no more than that it does not fit
+_MOST_GREY = 60.0  # grey levels, of a single pixel
 _FIT_WINDOW, _MEAN_WINDOW = 7, 21
 _HOLD = 1e-3  # information of the start: where nothing is told, it stays
 _SAME = 0.3  # px by which a wide window may differ from a narrow one, to be taken in its place
@@ -74,6 +75,25 @@ def _differences(first: int, last: int, current: Image8, mean: Map, view: Image8
                  - gain * (np.float32(view[i, j]) - view_mean[i, j]))
             error[i, j] = e
             squared[i, j] = min(e * e, np.float32(_MOST))
+
+
+@fast_kernel
+def _agree(first: int, last: int, current: Image8, mean: Map, view: Image8, view_mean: Map,
+           gain: np.float32, rho: Map, baseline: np.float32, least: Map,
+           most: Map) -> None:  # pragma: no cover - compiled
+    """Take one reference's difference in grey into the least and the most of them.
+
+    Where the reference looks too different, nothing is taken; baseline 0 = it always counts.
+    """
+    for i in range(first, last):
+        for j in range(rho.shape[1]):
+            if abs(rho[i, j]) * baseline >= np.float32(REACH):
+                continue
+            e = abs(np.float32(current[i, j]) - mean[i, j]
+                    - gain * (np.float32(view[i, j]) - view_mean[i, j]))
+            e = min(e, np.float32(_MOST_GREY))
+            least[i, j] = min(least[i, j], e)
+            most[i, j] = max(most[i, j], e)
 
 
 @fast_kernel
@@ -218,6 +238,19 @@ class JointRefinement:
         reference.
         """
         return self._difference(*self._references[0], rho)[2]
+
+    def agreement(self, rho: Map) -> tuple[Map, Map]:
+        """Least and most difference in grey, of the references, of each pixel by itself if it lies
+        at `rho`: grey levels less what is round about, float32 of the grid's shape.
+        """
+        least, most = np.full_like(rho, _MOST_GREY), np.zeros_like(rho)
+        for n, (image, pose) in enumerate(self._references):
+            view = reference_in_relief(image, pose, self._grid, self._axes, rho)
+            view_mean = _mean(view)
+            gain = _gain(self._current, self._mean, view, view_mean)
+            rows_in_parallel(_agree, len(rho), self._current, self._mean, view, view_mean, gain,
+                             rho, np.float32(pose.baseline if n else 0), least, most)
+        return least, most
 
     def _difference(self, image: Image8, pose: RelativePose, rho: Map) -> tuple[Map, Map, Map]:
         view = reference_in_relief(image, pose, self._grid, self._axes, rho)

@@ -33,7 +33,7 @@ _AT_ONCE = 64  # pixels that the network judges
 _LOGARITHMS = (0, 2, 4, 6, 8, 10, 12, 14, 16, 19, 21, 23, 24, 25, 26, 27, 29)  # of the inputs
 LEAST = 0.003  # of the unit: added to an error before its logarithm is taken
 TAIL = 1.3  # logarithm of how many standard deviations the 95th percentile may be away
-_NEAR_BY = 40.0  # shortest baselines: nearer than that, what may be nearer than measured matters
+NEAR_BY = 40.0  # shortest baselines: nearer than that, what may be nearer than measured matters
 _LEAST_SINE = 0.02
 # No look makes up for grey that tells nothing: at least so much of what noise alone would do.
 _TOLD = 1.0
@@ -289,7 +289,7 @@ def may_be_near(told: NDArray[np.float32], unit: Map, rho: Map, shortest: float)
     shortest : of the baselines, m
     """
     nearer = np.exp(told[2])
-    near = (rho + nearer * unit) * np.float32(_NEAR_BY * shortest) > 1
+    near = (rho + nearer * unit) * np.float32(NEAR_BY * shortest) > 1
     return np.asarray(nearer * near, np.float32)
 
 

@@ -15,6 +15,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from .alternatives import Alternatives
 from .convolutions import Convolutions
 from .frames import Image8
 from .jit import fast_kernel, rows_in_parallel
@@ -22,16 +23,18 @@ from .matching import UNKNOWN
 from .reliability import TAIL, Look, _geometry, logarithms
 from .warp import Map, PolarGrid
 
-CHANNELS = 25
+CHANNELS = 43
+_TOLD = 7  # outputs for each pixel
 BLOCK = 32  # px at half size: what the network halves five times
 _ROUND = 32  # px at half size that it sees beyond the seam
-_LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24)  # of the inputs
+ADDED = np.float32(0.1)  # px of the shortest baseline, before a parallax's logarithm is taken
+_LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24, *range(25, 43))  # of the inputs
 
 
 @fast_kernel
 def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
-           told: NDArray[np.float32], units: Map, sine: Map, scale: Map, h: int, w: int, x: Map,
-           p: int) -> None:  # pragma: no cover - compiled
+           others: NDArray[np.float32], told: NDArray[np.float32], units: Map, sine: Map,
+           scale: Map, h: int, w: int, x: Map, p: int) -> None:  # pragma: no cover - compiled
     """Fill column p of `x` (CHANNELS, pixels) of the pixel (h, w) at half size, before logarithms.
     """
     one, quarter = np.float32(1), np.float32(0.25)
@@ -60,6 +63,10 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
         information += full[4, r, c] * unit * unit
         longest += pixels * scale[2]
         sines += s
+        x[25 + n, p] = np.float32(2) + others[0, r, c]
+        x[29 + n, p] = np.float32(2) + others[1, r, c]
+        x[33 + n, p] = np.float32(2) + others[3, r, c]
+        x[38 + n, p] = np.float32(2) + others[5, r, c]
     x[4, p], x[9, p] = quarter * nearer, quarter * sign
     x[14, p] = np.float32(0.5) + half[12, h, w]
     x[15, p] = np.float32(0.1) + quarter * swept
@@ -69,12 +76,16 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
     x[21, p] = np.float32(0.1) + quarter * longest
     x[22, p], x[23, p] = quarter * sines, high - low
     x[24, p] = np.float32(0.05) + half[13, h, w]
+    for k in range(2):
+        share = others[2 + 2 * k, 2 * h, 2 * w] / units[2 * h, 2 * w]
+        x[37 + 5 * k, p] = np.float32(1.1) + min(max(share, -one), np.float32(20))
 
 
 @fast_kernel
 def _input_rows(first: int, last: int, view: Image8, full: NDArray[np.float32],
-                half: NDArray[np.float32], told: NDArray[np.float32], units: Map, sine: Map,
-                scale: Map, wrap: int, out: NDArray[np.float32]) -> None:  # pragma: no cover
+                half: NDArray[np.float32], others: NDArray[np.float32],
+                told: NDArray[np.float32], units: Map, sine: Map, scale: Map, wrap: int,
+                out: NDArray[np.float32]) -> None:  # pragma: no cover - compiled
     """Rows of `out` (1, CHANNELS, …): half size, on round the sphere, at the end as the last.
 
     By blocks of pixels: rows of channels lie a power of two apart, and push each other out of
@@ -86,7 +97,7 @@ def _input_rows(first: int, last: int, view: Image8, full: NDArray[np.float32],
         h = (i - _ROUND - wrap) % (rows - 2 * wrap) + wrap
         for start in range(0, out.shape[3], BLOCK):
             for p in range(BLOCK):
-                _input(view, full, half, told, units, sine, scale, h,
+                _input(view, full, half, others, told, units, sine, scale, h,
                        min(start + p, columns - 1), x, p)
             logarithms(x, _LOGARITHMS)
             for p in range(BLOCK):
@@ -95,13 +106,15 @@ def _input_rows(first: int, last: int, view: Image8, full: NDArray[np.float32],
                 x[20, p] *= np.float32(0.2)
                 x[21, p] *= np.float32(0.5)
                 x[24, p] += np.float32(1)
+                for k in range(25, CHANNELS):
+                    x[k, p] -= np.float32(0 if k == 37 or k == 42 else 2)
             for k in range(CHANNELS):
                 for p in range(BLOCK):
                     out[0, k, i, start + p] = x[k, p]
 
 
-def inputs(view: Image8, seen: Look, told: NDArray[np.float32], unit: Map, grid: PolarGrid,
-           baselines: Sequence[float]) -> NDArray[np.float32]:
+def inputs(view: Image8, seen: Look, others: Alternatives, told: NDArray[np.float32], unit: Map,
+           grid: PolarGrid, baselines: Sequence[float]) -> NDArray[np.float32]:
     """What the network sees: float32 (1, CHANNELS, rows, columns), half the grid's size and more,
     so that it can be halved again and goes on beyond the seam.
 
@@ -109,6 +122,7 @@ def inputs(view: Image8, seen: Look, told: NDArray[np.float32], unit: Map, grid:
     ----------
     view : the current view on `grid`
     seen : of `reliability.look`
+    others : of `alternatives.alternatives`
     told, unit : of `reliability.percentiles`
     grid, baselines : the polar grid; of the references, m
 
@@ -116,7 +130,9 @@ def inputs(view: Image8, seen: Look, told: NDArray[np.float32], unit: Map, grid:
     rows, columns = seen.half.shape[1:]
     size = [-(-n // BLOCK) * BLOCK for n in (rows + 2 * _ROUND, columns)]
     out = np.empty((1, CHANNELS, *size), np.float32)
-    rows_in_parallel(_input_rows, size[0], view, seen.full, seen.half, told, unit,
+    stacked = np.stack([others.least, others.most, others.near, others.near_least, others.far,
+                        others.far_least])
+    rows_in_parallel(_input_rows, size[0], view, seen.full, seen.half, stacked, told, unit,
                      *_geometry(grid, baselines), grid.wrap // 2, out)
     return out
 
@@ -133,11 +149,26 @@ def _network() -> Convolutions:
 
 
 def judged(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """The network's outputs: float32 (3, *shape), as of `reliability.percentiles`.
+    """The network's outputs: float32 (7, *shape); three as of `reliability.percentiles`, the
+    logarithm by which the completed parallax (see `completed`) is larger than the measured one,
+    and the same three of its error.
 
     x : of `inputs`
     shape : of the polar grid
     """
     found = interior(_network()(x), shape)
-    parts = found.reshape(3, 2, 2, *found.shape[2:])
-    return np.ascontiguousarray(parts.transpose(0, 3, 1, 4, 2)).reshape(3, *shape)
+    parts = found.reshape(_TOLD, 2, 2, *found.shape[2:])
+    return np.ascontiguousarray(parts.transpose(0, 3, 1, 4, 2)).reshape(_TOLD, *shape)
+
+
+def completed(larger: Map, unit: Map, grid: PolarGrid,
+              baselines: Sequence[float]) -> tuple[Map, Map]:
+    """The inverse range that what is round about suggests, and its unit; 1/m, of grid.shape.
+
+    larger : of `judged`; unit : of `reliability.percentiles`
+    """
+    sine, scale = _geometry(grid, baselines)
+    pixel = scale[0] / sine  # 1/m of a pixel, times the baseline
+    pixels = (ADDED + unit * (scale[1] / pixel)) * np.exp(larger) - ADDED
+    rho = np.maximum(pixels, np.float32(0)) * (pixel / scale[1])
+    return np.asarray(rho, np.float32), np.asarray(np.maximum(rho, pixel / scale[2]), np.float32)

@@ -1,0 +1,51 @@
+"""What else may be where something was measured."""
+from __future__ import annotations
+
+import numpy as np
+from test_refinement import BALL, seen
+
+from sphstereo_ros.core.alternatives import alternatives
+from sphstereo_ros.core.refinement import JointRefinement
+
+SIZE = 15 // 2  # px that are round about
+
+
+def refinement_of(view):
+    return JointRefinement(view.image, view.grid, view.axes, view.pairs)
+
+
+def test_references_differ_least_where_things_are():
+    view = seen()
+    theta = view.theta()
+    inside = (theta > 20) & (theta < 160)
+    true, wrong = (refinement_of(view).agreement((view.rho() * s).astype(np.float32))
+                   for s in (1, 1.4))
+    for right, off in zip(true, wrong, strict=True):
+        assert np.median(right[inside]) < 3
+        assert np.median(off[inside]) > 3 * np.median(right[inside])
+    assert (true[0] <= true[1]).all()
+
+
+def test_nearest_and_farthest_round_about_without_specks():
+    view = seen()
+    rho = np.full(view.grid.shape, 0.2, np.float32)
+    rho[100:, :] = 0.5
+    rho[60, 60] = 9  # a speck
+    found = alternatives(rho, refinement_of(view))
+    assert (found.near[50:70] == np.float32(0.2)).all()
+    near, far = 101 - SIZE, 99 + SIZE  # a row at a rim is a speck as well
+    assert (found.near[near:] == np.float32(0.5)).all()
+    assert (found.near[:near] == np.float32(0.2)).all()
+    assert (found.far[:far] == np.float32(0.2)).all()
+    assert (found.far[far:] == np.float32(0.5)).all()
+
+
+def test_each_is_compared_with_the_references():
+    view, refinement = seen(), refinement_of(seen())
+    rho = np.full(view.grid.shape, 1 / BALL.radius, np.float32)
+    rho[:, view.grid.shape[1] // 2:] *= 1.5
+    found = alternatives(rho, refinement)
+    for value, least in ((rho, found.least), (found.near, found.near_least),
+                         (found.far, found.far_least)):
+        np.testing.assert_array_equal(least, refinement.agreement(value)[0])
+    np.testing.assert_array_equal(found.most, refinement.agreement(rho)[1])

@@ -1,0 +1,84 @@
+"""What was not measured, or is likelier otherwise, is completed."""
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_reliability import BASELINES, GRID, found, others_of
+
+from sphstereo_ros.core import judgement
+from sphstereo_ros.core.frames import Image8
+from sphstereo_ros.core.judgement import Found, Judged, by_looks
+from sphstereo_ros.core.refinement import Refined
+from sphstereo_ros.core.reliability import LEAST
+
+RHO = 0.5  # 1/m, measured
+GUESS = 0.4
+PIXEL = GRID.pixel / np.maximum(np.abs(np.sin(GRID.theta())), 0.02)  # rad across the motion
+VIEW = np.full(GRID.shape, 100, np.uint8)
+
+
+def judged_with(monkeypatch, likely: float, completed: float, nearer: float = 0.01,
+                misfit: float = 1, pictures: tuple[Image8, Image8] = (VIEW, VIEW)) -> Judged:
+    """Likely errors of what is measured and of what is completed, and by how much that may be
+    nearer, in units.
+    """
+    shape = GRID.shape
+    rho = np.full(shape, RHO, np.float32)
+
+    def told(*errors: float) -> np.ndarray:
+        logarithms = np.log(np.array([*errors, *errors[-1:] * (3 - len(errors))]) + LEAST)
+        return np.broadcast_to(logarithms[:, None, None], (3, *shape)).astype(np.float32)
+    small, large = (np.log(0.1 + r * BASELINES[0] / PIXEL) for r in (RHO, GUESS))
+    larger = np.broadcast_to(large - small, (1, *shape)).astype(np.float32)
+    _, _, _, matched, parallax = found(np.random.default_rng(0))
+    refined = Refined(rho, np.full(shape, 1e9, np.float32), np.full(shape, misfit, np.float32))
+    monkeypatch.setattr(judgement, 'percentiles', lambda *_: (told(likely), rho))
+    monkeypatch.setattr(judgement, 'judged', lambda *_: np.concatenate([
+        told(likely), larger, told(completed, completed, nearer)]))
+    return by_looks(Found(VIEW, *pictures, refined, rho, matched, parallax), others_of(refined),
+                    GRID, BASELINES)
+
+
+@pytest.mark.parametrize(('likely', 'completed', 'taken'), [
+    (0.5, 0.02, True), (0.9, 0.02, True), (0.01, 0.02, False), (0.9, 0.9, False)])
+def test_the_likelier_stands(monkeypatch, likely, completed, taken):
+    judged = judged_with(monkeypatch, likely, completed)
+    np.testing.assert_allclose(judged.rho, GUESS if taken else RHO, rtol=1e-3)
+    if taken:
+        assert (judged.frames == 1).all()
+        unit = np.maximum(GUESS, PIXEL / BASELINES[1])
+        np.testing.assert_allclose(judged.error, completed * np.broadcast_to(unit, VIEW.shape),
+                                   rtol=0.05)
+
+
+def test_where_nothing_shows_the_same_it_is_not_measured_but_completed(monkeypatch):
+    assert (judged_with(monkeypatch, 0.01, 0.02, misfit=300).frames == 1).all()
+    assert (judged_with(monkeypatch, 0.01, 0.9, misfit=300).frames == 0).all()
+
+
+def test_what_may_be_much_nearer_is_not_completed(monkeypatch):
+    judged = judged_with(monkeypatch, 0.9, 0.02, nearer=2)
+    np.testing.assert_array_equal(judged.rho, np.float32(RHO))
+    assert (judged.frames <= 0).all()
+
+
+@pytest.mark.parametrize(('differs', 'taken'), [
+    (3, True), (-3, True), (20, False), (-20, False)])
+def test_what_the_reference_contradicts_is_not_completed(monkeypatch, differs, taken):
+    there = np.full_like(VIEW, 100 + differs)
+    judged = judged_with(monkeypatch, 0.9, 0.02, pictures=(VIEW, there))
+    assert (judged.frames == (1 if taken else 0)).all()
+
+
+def test_the_reference_is_asked_where_it_would_be_seen(monkeypatch):
+    """A ramp of grey, that in the reference lies where the parallax takes it."""
+    theta, column = GRID.theta(), np.arange(GRID.shape[1])
+    before = np.arctan2(np.sin(theta), np.cos(theta) + GUESS * BASELINES[0])
+    at = column - (theta - before) / GRID.pixel
+    sphere = slice(GRID.margin, -GRID.margin)  # beyond it, angles run back
+    ramp, moved = (np.broadcast_to(np.rint(r), GRID.shape).astype(np.uint8)
+                   for r in (3 * column, np.interp(column, at[sphere], 3 * column[sphere])))
+    inside = np.sin(theta) > 0.95
+    for there, taken in ((moved, 1), (ramp, 0)):
+        judged = judged_with(monkeypatch, 0.9, 0.02, pictures=(ramp, there))
+        assert (judged.frames[:, inside] == taken).all()
