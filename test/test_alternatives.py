@@ -26,6 +26,18 @@ def test_references_differ_least_where_things_are():
     assert (true[0] <= true[1]).all()
 
 
+def test_of_the_references_the_one_that_fits_best_and_worst():
+    view = seen()
+    rho = (1.2 * view.rho()).astype(np.float32)
+    each = [JointRefinement(view.image, view.grid, view.axes, [pair]).agreement(rho)[0]
+            for pair in view.pairs]
+    least, most = refinement_of(view).agreement(rho)
+    np.testing.assert_allclose(least, np.minimum(*each), atol=1e-4)
+    np.testing.assert_allclose(most, np.maximum(*each), atol=1e-4)
+    assert np.mean(each[0] > each[1]) > 0.1
+    assert np.mean(each[0] < each[1]) > 0.1
+
+
 def test_nearest_and_farthest_round_about_without_specks():
     view = seen()
     rho = np.full(view.grid.shape, 0.2, np.float32)

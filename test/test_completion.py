@@ -18,25 +18,31 @@ VIEW = np.full(GRID.shape, 100, np.uint8)
 
 
 def judged_with(monkeypatch, likely: float, completed: float, nearer: float = 0.01,
-                misfit: float = 1, pictures: tuple[Image8, Image8] = (VIEW, VIEW)) -> Judged:
+                misfit: float = 1, pictures: tuple[Image8, Image8] = (VIEW, VIEW),
+                amid: float = 0.01) -> Judged:
     """Likely errors of what is measured and of what is completed, and by how much that may be
-    nearer, in units.
+    nearer, in units: what is judged of every second row. Of those amid, nothing is likelier than
+    what was measured, with a likely error of `amid`.
     """
     shape = GRID.shape
     rho = np.full(shape, RHO, np.float32)
 
     def told(*errors: float) -> np.ndarray:
         logarithms = np.log(np.array([*errors, *errors[-1:] * (3 - len(errors))]) + LEAST)
-        return np.broadcast_to(logarithms[:, None, None], (3, *shape)).astype(np.float32)
+        found = np.broadcast_to(logarithms[:, None, None], (3, *shape)).astype(np.float32)
+        found[:, ::2] = np.log(amid + LEAST)
+        return found
     small, large = (np.log(0.1 + r * BASELINES[0] / PIXEL) for r in (RHO, GUESS))
     larger = np.broadcast_to(large - small, (1, *shape)).astype(np.float32)
     _, _, _, matched, parallax = found(np.random.default_rng(0))
-    refined = Refined(rho, np.full(shape, 1e9, np.float32), np.full(shape, misfit, np.float32))
+    fits = np.where(np.arange(shape[0])[:, None] % 2, misfit, 1) + np.zeros(shape)
+    refined = Refined(rho, np.full(shape, 1e9, np.float32), fits.astype(np.float32))
     monkeypatch.setattr(judgement, 'percentiles', lambda *_: (told(likely), rho))
     monkeypatch.setattr(judgement, 'judged', lambda *_: np.concatenate([
         told(likely), larger, told(completed, completed, nearer)]))
-    return by_looks(Found(VIEW, *pictures, refined, rho, matched, parallax), others_of(refined),
-                    GRID, BASELINES)
+    judged = by_looks(Found(VIEW, *pictures, refined, rho, matched, parallax),
+                      others_of(refined), GRID, BASELINES)
+    return Judged(*(m[1::2] for m in (judged.rho, judged.other, judged.error, judged.frames)))
 
 
 @pytest.mark.parametrize(('likely', 'completed', 'taken'), [
@@ -46,8 +52,8 @@ def test_the_likelier_stands(monkeypatch, likely, completed, taken):
     np.testing.assert_allclose(judged.rho, GUESS if taken else RHO, rtol=1e-3)
     if taken:
         assert (judged.frames == 1).all()
-        unit = np.maximum(GUESS, PIXEL / BASELINES[1])
-        np.testing.assert_allclose(judged.error, completed * np.broadcast_to(unit, VIEW.shape),
+        error = completed * np.maximum(GUESS, PIXEL / BASELINES[1])
+        np.testing.assert_allclose(judged.error, np.broadcast_to(error, judged.rho.shape),
                                    rtol=0.05)
 
 
@@ -82,3 +88,8 @@ def test_the_reference_is_asked_where_it_would_be_seen(monkeypatch):
     for there, taken in ((moved, 1), (ramp, 0)):
         judged = judged_with(monkeypatch, 0.9, 0.02, pictures=(ramp, there))
         assert (judged.frames[:, inside] == taken).all()
+
+
+def test_where_nothing_is_known_round_about_nothing_is_completed(monkeypatch):
+    assert (judged_with(monkeypatch, 0.9, 0.02).frames == 1).all()
+    assert (judged_with(monkeypatch, 0.9, 0.02, amid=0.9).frames == 0).all()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from analytic_world import Ball, View, World, look, true_pose, window
 
-from sphstereo_ros.core import rotations
+from sphstereo_ros.core import joint, rotations
 from sphstereo_ros.core.config import StereoConfig, resolve
 from sphstereo_ros.core.frames import (
     UNSCALED,
@@ -44,6 +44,18 @@ def seen(world: World = ROOM, positions: Positions = TWO, turn: tuple = (0, 0, 0
 def measured(method: str, view: PairedWindow) -> Measurement:
     config = StereoConfig(matcher=method, num_disparities=48)
     return JointMatcher(method, matcher(config)).measure(view.current, view.references)
+
+
+def test_what_is_judged_is_what_is_measured(monkeypatch):
+    """Range, too, where something else is likelier than what was measured."""
+    _, view = seen()
+    before = measured('joint', view)
+    decide = joint.by_looks
+    monkeypatch.setattr(joint, 'by_looks', lambda *given: replace(
+        decide(*given), rho=np.full_like(given[0].view, 0.25, np.float32)))
+    found = measured('joint', view)
+    assert np.ptp(before.rho) > 0.1
+    np.testing.assert_allclose(found.rho, 0.25, rtol=1e-6)
 
 
 def altered(view: PairedWindow, reference: Callable[[np.ndarray], np.ndarray],

@@ -4,6 +4,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,9 +29,11 @@ _PLAIN = 0.3  # of the unit: with a smaller likely error it counts for two frame
 # is not believed either.
 _NEARER, _VEILED = 0.6, 1.2
 _TAIL = 0.75  # of what is published
-# What is completed counts with such a likely error, in its unit, where it is likelier than what
-# was measured; and not where the reference differs by so many grey levels.
-_SURE_COMPLETED, _LIKELIER, _CONTRADICTS = 0.2, 1.0, 6.0
+# What is completed counts with such a likely error, in its unit, where what was measured is less
+# likely, and differs by such a share; not where the reference differs by so many grey levels, nor
+# where less than such a share of what is round about (of the grid's height) is sure.
+_SURE_COMPLETED, _DIFFERS, _CONTRADICTS = 0.2, 0.03, 6.0
+_AMID, _ROUND = 0.15, 1 / 15
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
 _AGREES, _LEVELS, _SLACK = 0.05, 0.75, 1.5
@@ -94,17 +97,21 @@ def by_looks(found: Found, others: Alternatives, grid: PolarGrid,
     guess = completed(wider[3], unit, grid, baselines)
     scale = np.array([grid.pixel, min(baselines), np.exp(-_TAIL)], np.float32)
     theta = grid.theta().astype(np.float32)
-    rows_in_parallel(_complete_rows, len(rho), found.now, found.before, wider[4:], *guess, theta,
-                     scale, rho, error, frames)
+    window = round(_ROUND * grid.height) // 2 * 2 + 1
+    amid = cv2.blur(sure.astype(np.float32), (window, window))
+    rows_in_parallel(_complete_rows, len(rho), found.now, found.before, wider[4:], *guess, amid,
+                     theta, scale, rho, error, frames)
     return Judged(rho, found.other, error, frames)
 
 
 @fast_kernel
 def _complete_rows(first: int, last: int, view: Image8, before: Image8,
-                   told: NDArray[np.float32], guess: Map, unit: Map, theta: Map, scale: Map,
-                   rho: Map, error: Map, frames: Evidence) -> None:  # pragma: no cover - compiled
+                   told: NDArray[np.float32], guess: Map, unit: Map, amid: Map, theta: Map,
+                   scale: Map, rho: Map, error: Map,
+                   frames: Evidence) -> None:  # pragma: no cover - compiled
     """What was measured (rho, error, frames) becomes what is completed, where that is likelier.
 
+    told, guess, unit : of `judged` and `completed`; amid : share of what is sure round about
     scale : rad of a pixel, shortest baseline, share of the 95th percentile that is likely
     """
     least, end = np.float32(LEAST), np.float32(view.shape[1] - 1.001)
@@ -113,10 +120,13 @@ def _complete_rows(first: int, last: int, view: Image8, before: Image8,
             likely = max(max(np.exp(told[0, i, j]) - least,
                              (np.exp(told[1, i, j]) - least) * scale[2]), np.float32(0))
             if likely > np.float32(_SURE_COMPLETED) or (
-                    frames[i, j] > 0
-                    and likely * unit[i, j] > np.float32(_LIKELIER) * error[i, j]):
+                    amid[i, j] < np.float32(_AMID)):
                 continue
             nearer, there = np.exp(told[2, i, j]), guess[i, j]
+            spread = likely * unit[i, j]
+            alike = np.float32(_DIFFERS) * max(there, rho[i, j])
+            if frames[i, j] > 0 and (spread > error[i, j] or abs(there - rho[i, j]) < alike):
+                continue
             if nearer > np.float32(_NEARER) and (
                     (there + nearer * unit[i, j]) * np.float32(NEAR_BY) * scale[1] > 1):
                 continue
@@ -129,7 +139,7 @@ def _complete_rows(first: int, last: int, view: Image8, before: Image8,
                     + np.float32(before[i, left + 1]) * share)
             if abs(np.float32(view[i, j]) - grey) > np.float32(_CONTRADICTS):
                 continue
-            rho[i, j], error[i, j], frames[i, j] = there, likely * unit[i, j], np.int8(1)
+            rho[i, j], error[i, j], frames[i, j] = there, spread, np.int8(1)
 
 
 def together(own: NDArray[np.float32], wider: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -28,6 +28,7 @@ _TOLD = 7  # outputs for each pixel
 BLOCK = 32  # px at half size: what the network halves five times
 _ROUND = 32  # px at half size that it sees beyond the seam
 ADDED = np.float32(0.1)  # px of the shortest baseline, before a parallax's logarithm is taken
+_LEAST = np.float32(1e-3)  # px that are told at least
 _LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24, *range(25, 43))  # of the inputs
 
 
@@ -170,5 +171,5 @@ def completed(larger: Map, unit: Map, grid: PolarGrid,
     sine, scale = _geometry(grid, baselines)
     pixel = scale[0] / sine  # 1/m of a pixel, times the baseline
     pixels = (ADDED + unit * (scale[1] / pixel)) * np.exp(larger) - ADDED
-    rho = np.maximum(pixels, np.float32(0)) * (pixel / scale[1])
+    rho = np.maximum(pixels, _LEAST) * (pixel / scale[1])
     return np.asarray(rho, np.float32), np.asarray(np.maximum(rho, pixel / scale[2]), np.float32)
