@@ -19,7 +19,7 @@ VIEW = np.full(GRID.shape, 100, np.uint8)
 
 def judged_with(monkeypatch, likely: float, completed: float, nearer: float = 0.01,
                 misfit: float = 1, pictures: tuple[Image8, Image8] = (VIEW, VIEW),
-                amid: float = 0.01) -> Judged:
+                amid: float = 0.01, guess: float = GUESS) -> Judged:
     """Likely errors of what is measured and of what is completed, and by how much that may be
     nearer, in units: what is judged of every second row. Of those amid, nothing is likelier than
     what was measured, with a likely error of `amid`.
@@ -32,7 +32,7 @@ def judged_with(monkeypatch, likely: float, completed: float, nearer: float = 0.
         found = np.broadcast_to(logarithms[:, None, None], (3, *shape)).astype(np.float32)
         found[:, ::2] = np.log(amid + LEAST)
         return found
-    small, large = (np.log(0.1 + r * BASELINES[0] / PIXEL) for r in (RHO, GUESS))
+    small, large = (np.log(0.1 + r * BASELINES[0] / PIXEL) for r in (RHO, guess))
     larger = np.broadcast_to(large - small, (1, *shape)).astype(np.float32)
     _, _, _, matched, parallax = found(np.random.default_rng(0))
     fits = np.where(np.arange(shape[0])[:, None] % 2, misfit, 1) + np.zeros(shape)
@@ -55,6 +55,12 @@ def test_the_likelier_stands(monkeypatch, likely, completed, taken):
         error = completed * np.maximum(GUESS, PIXEL / BASELINES[1])
         np.testing.assert_allclose(judged.error, np.broadcast_to(error, judged.rho.shape),
                                    rtol=0.05)
+
+
+@pytest.mark.parametrize(('guess', 'taken'), [(0.98, False), (1.02, False), (0.94, True)])
+def test_what_is_nearly_the_same_stays_as_it_was_measured(monkeypatch, guess, taken):
+    judged = judged_with(monkeypatch, 0.5, 0.02, guess=guess * RHO)
+    np.testing.assert_allclose(judged.rho, guess * RHO if taken else RHO, rtol=1e-3)
 
 
 def test_where_nothing_shows_the_same_it_is_not_measured_but_completed(monkeypatch):
