@@ -25,7 +25,7 @@ from sphstereo_ros.core.surroundings import CHANNELS, completed, inputs, judged
 from sphstereo_ros.scenes.binocular import render_binocular, save_binocular
 from sphstereo_ros.scenes.sequence import true_pose
 
-ROUND = BLOCK = 32  # rows of half size beyond the seam; what sizes are multiples of
+ROUND, BLOCK = 64, 32  # rows of half size beyond the seam; what sizes are multiples of
 
 
 def seen_at(parts, baselines=BASELINES):
@@ -78,7 +78,7 @@ def test_beyond_the_seam_comes_what_lies_there():
     inner = rows - 2 * wrap
     x = out[0]
     np.testing.assert_array_equal(x[:, :ROUND + wrap], x[:, inner:inner + ROUND + wrap])
-    assert not np.array_equal(x[:, :ROUND], x[:, ROUND:2 * ROUND])
+    assert not np.array_equal(x[:, :ROUND // 2], x[:, ROUND // 2:ROUND])
 
 
 def test_sizes_halve_evenly():
@@ -99,7 +99,7 @@ def test_only_what_is_relative_counts(scale, seed):
 
 
 def test_a_view_that_is_turned_is_judged_as_before():
-    """About the direction of motion; the network sees 32 px of half size beyond the seam."""
+    """About the direction of motion; the network sees 64 px of half size beyond the seam."""
     parts = found(np.random.default_rng(4))
     turn, wrap = 16, GRID.wrap
 

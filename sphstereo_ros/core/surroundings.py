@@ -26,7 +26,7 @@ from .warp import Map, PolarGrid
 CHANNELS = 43
 _TOLD = 7  # outputs for each pixel
 BLOCK = 32  # px at half size: what the network halves five times
-_ROUND = 32  # px at half size that it sees beyond the seam
+_ROUND = 64  # px at half size that it sees beyond the seam
 ADDED = np.float32(0.1)  # px of the shortest baseline, before a parallax's logarithm is taken
 _LEAST = np.float32(1e-3)  # px that are told at least
 _LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24, *range(25, 43))  # of the inputs
