@@ -97,11 +97,19 @@ def by_looks(found: Found, others: Alternatives, grid: PolarGrid,
     guess = completed(wider[3], unit, grid, baselines)
     scale = np.array([grid.pixel, min(baselines), np.exp(-_TAIL)], np.float32)
     theta = grid.theta().astype(np.float32)
-    window = round(_ROUND * grid.height) // 2 * 2 + 1
-    amid = cv2.blur(sure.astype(np.float32), (window, window))
-    rows_in_parallel(_complete_rows, len(rho), found.now, found.before, wider[4:], *guess, amid,
-                     theta, scale, rho, error, frames)
+    rows_in_parallel(_complete_rows, len(rho), found.now, found.before, wider[4:], *guess,
+                     _share_round(sure, grid), theta, scale, rho, error, frames)
     return Judged(rho, found.other, error, frames)
+
+
+def _share_round(sure: NDArray[np.bool_], grid: PolarGrid) -> Map:
+    """Share of what is sure round about each pixel, on round the sphere."""
+    reach = round(_ROUND * grid.height / 2)
+    inner = sure[grid.wrap:-grid.wrap].astype(np.float32)
+    beyond = [(n + np.arange(-grid.wrap - reach, 0)) % len(inner) for n in (0, grid.wrap + reach)]
+    whole = np.concatenate([inner[beyond[0]], inner, inner[beyond[1]]])
+    size = (2 * reach + 1, 2 * reach + 1)
+    return np.asarray(cv2.blur(whole, size)[reach:len(whole) - reach], np.float32)
 
 
 @fast_kernel
