@@ -36,7 +36,7 @@ def test_a_fit_tells_small_errors_from_large_ones():
     x[22, :, 32:] += 1
     sigma = np.where(np.arange(128) < 64, 0.02, 0.2)[None] * np.ones((128, 1))
     error = (sigma * rng.normal(size=(128, 128))).astype(np.float32)
-    parts = fit([patch_of(x, error)], 60, rng)
+    parts = fit([patch_of(x, error)], 240, rng)
     with torch.no_grad():
         out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
     told = np.exp(out[:4].mean(0))

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from .alternatives import Alternatives
 from .frames import Image8
 from .jit import fast_kernel, rows_in_parallel
+from .match_judge import likely_error, shows_the_same
 from .matching import Parallax
 from .refinement import Refined
-from .reliability import LEAST, NEAR_BY, expected_error, look, may_be_near, network, percentiles
+from .reliability import NEAR_BY, expected_error, look, may_be_near, network, percentiles
 from .surroundings import completed, inputs, judged
 from .sweep import reduction
 from .warp import Map, PolarGrid, _arctan2
@@ -30,9 +31,9 @@ _PLAIN = 0.3  # of the unit: with a smaller likely error it counts for two frame
 _NEARER, _VEILED = 0.6, 1.2
 _TAIL = 0.75  # of what is published
 # What is completed counts with such a likely error, in its unit, where what was measured is less
-# likely, and differs by such a share; not where the reference differs by so many grey levels, nor
-# where less than such a share of what is round about (of the grid's height) is sure.
-_SURE_COMPLETED, _DIFFERS, _CONTRADICTS = 0.2, 0.03, 6.0
+# likely, and differs by such a share; not where the reference shows something else, nor where less
+# than such a share of what is round about (of the grid's height) is sure.
+_SURE_COMPLETED, _DIFFERS = 0.2, 0.03
 _AMID, _ROUND = 0.15, 1 / 15
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
@@ -122,13 +123,10 @@ def _complete_rows(first: int, last: int, view: Image8, before: Image8,
     told, guess, unit : of `judged` and `completed`; amid : share of what is sure round about
     scale : rad of a pixel, shortest baseline, share of the 95th percentile that is likely
     """
-    least, end = np.float32(LEAST), np.float32(view.shape[1] - 1.001)
     for i in range(first, last):
         for j in range(rho.shape[1]):
-            likely = max(max(np.exp(told[0, i, j]) - least,
-                             (np.exp(told[1, i, j]) - least) * scale[2]), np.float32(0))
-            if likely > np.float32(_SURE_COMPLETED) or (
-                    amid[i, j] < np.float32(_AMID)):
+            likely = likely_error(told, 0, i, j, scale[2])
+            if likely > np.float32(_SURE_COMPLETED) or amid[i, j] < np.float32(_AMID):
                 continue
             nearer, there = np.exp(told[2, i, j]), guess[i, j]
             spread = likely * unit[i, j]
@@ -139,13 +137,7 @@ def _complete_rows(first: int, last: int, view: Image8, before: Image8,
                     (there + nearer * unit[i, j]) * np.float32(NEAR_BY) * scale[1] > 1):
                 continue
             moved = _arctan2(np.sin(theta[j]), np.cos(theta[j]) + there * scale[1])
-            pixels = (theta[j] - moved) / scale[0]
-            at = min(max(np.float32(j) - pixels, np.float32(0)), end)
-            left = np.int32(at)
-            share = at - np.float32(left)
-            grey = (np.float32(before[i, left]) * (1 - share)
-                    + np.float32(before[i, left + 1]) * share)
-            if abs(np.float32(view[i, j]) - grey) > np.float32(_CONTRADICTS):
+            if not shows_the_same(view, before, i, j, (theta[j] - moved) / scale[0]):
                 continue
             rho[i, j], error[i, j], frames[i, j] = there, spread, np.int8(1)
 

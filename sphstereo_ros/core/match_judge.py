@@ -162,7 +162,7 @@ def told(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 @fast_kernel
-def _likely(told: NDArray[np.float32], k: int, i: int, j: int,
+def likely_error(told: NDArray[np.float32], k: int, i: int, j: int,
             tail: np.float32) -> np.float32:  # pragma: no cover - compiled
     """Standard deviation as a share, from percentiles k and k + 1."""
     least = np.float32(LEAST)
@@ -180,7 +180,7 @@ def _stands(pixels: np.float32, likely: np.float32, nearer: np.float32,
 
 
 @fast_kernel
-def _shows_the_same(current: Image8, reference: Image8, r: int, c: int,
+def shows_the_same(current: Image8, reference: Image8, r: int, c: int,
                     pixels: np.float32) -> bool:  # pragma: no cover - compiled
     """Whether the reference does not contradict such a parallax."""
     end = np.float32(current.shape[1] - 1.001)
@@ -202,7 +202,8 @@ def _judge_rows(first: int, last: int, current: Image8, reference: Image8,
     unknown, least, one = np.float32(UNKNOWN), np.float32(LEAST), np.float32(1)
     for i in range(first, last):
         for j in range(sigma.shape[1]):
-            likely, likely_completed = _likely(told, 0, i, j, tail), _likely(told, 4, i, j, tail)
+            likely = likely_error(told, 0, i, j, tail)
+            likely_completed = likely_error(told, 4, i, j, tail)
             nearer, nearer_completed = np.exp(told[2, i, j]) - least, np.exp(told[6, i, j]) - least
             completed = max(np.exp(told[3, i, j]) - np.float32(0.5), np.float32(0.01))
             widest = np.float32(0.02)
@@ -211,7 +212,7 @@ def _judge_rows(first: int, last: int, current: Image8, reference: Image8,
                 d, bound = pixels[r, c], near * sine[c]
                 found = _stands(d, likely, nearer, bound)
                 other = _stands(completed, likely_completed, nearer_completed, bound) and (
-                    _shows_the_same(current, reference, r, c, completed))
+                    shows_the_same(current, reference, r, c, completed))
                 if other and (not found or likely_completed * max(completed, one)
                               < likely * max(d, one)):
                     pixels[r, c] = completed
