@@ -195,7 +195,7 @@ def test_mirrors_and_what_is_under_the_floor_are_looked_for(monkeypatch, matcher
             'stereo.matcher': matcher, 'stereo.num_disparities': 16, 'stereo.block_size': 5,
             'baseline.source': 'odometry'})).process(window).range).any())
     monkeypatch.setattr(match_judge, 'told', lambda x, shape: np.full(
-        (3, shape[0] // 2, shape[1] // 2), -5, np.float32))  # everything is believed
+        (7, shape[0] // 2, shape[1] // 2), -5, np.float32))  # everything is believed
     assert known()
     with monkeypatch.context() as patch:
         patch.setattr(stereo, 'far_islands', lambda r: everywhere)
