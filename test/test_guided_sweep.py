@@ -126,7 +126,7 @@ def test_planes_are_found_and_what_bends_is_not():
 def test_levels_get_coarser_before_the_nearest_are_left_out(baselines, height, nearest):
     found = _fine_levels(baselines, np.pi / height, nearest)
     assert 3 <= len(found) < MOST_LEVELS
-    assert found[-1] >= min(nearest, 1 / 0.3, 2 / min(baselines))
+    assert found[-1] >= min(nearest, 0.93 / min(baselines))
 
 
 def test_what_is_near_is_found_where_it_is_known_to_be_far():

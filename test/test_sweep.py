@@ -80,10 +80,19 @@ def test_steps_of_parallax_are_even_and_fine_for_every_baseline_that_takes_part(
 
 @settings(deadline=None)
 @given(st.floats(0.02, 30.0), st.integers(16, 960))
-def test_levels_of_one_baseline_reach_to_the_nearest_that_matters(baseline, height):
-    """To 0.3 m, or to half of the baseline, unless there would be too many."""
+def test_levels_of_one_baseline_reach_to_little_more_than_it(baseline, height):
     found = levels([baseline], np.pi / height)
-    assert found[-1] >= min(1 / 0.3, 2 / baseline) or len(found) == 256
+    assert found[-1] >= 0.93 / baseline
+
+
+@settings(deadline=None)
+@given(BASELINES, HEIGHTS, st.floats(0.01, 100.0))
+def test_levels_are_the_same_in_every_unit_of_length(baselines, height, scale):
+    found = levels(baselines, np.pi / height)
+    other = levels([scale * b for b in baselines], np.pi / height)
+    least = min(len(found), len(other))  # the last may be left out for rounding
+    assert max(len(found), len(other)) <= least + 1
+    np.testing.assert_allclose(scale * other[:least], found[:least], rtol=1e-6)
 
 
 # --- census

@@ -9,6 +9,7 @@ the column. Done at half size: what it finds is a start or a second opinion, not
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -26,8 +27,8 @@ Signature = NDArray[np.uint32]
 Volume = NDArray[np.uint16]
 
 _MARGIN = 8
-_NEAREST = 0.3  # m: the last level, at the latest
-_CLOSEST, MOST_LEVELS = 2.0, 256  # of the nearest baseline over range
+# Of the nearest baseline over range: beyond, a reference sees other sides of things.
+_CLOSEST, MOST_LEVELS = 14 / 15, 256
 _LEVEL = 1.5  # px of parallax between levels, of the longest baseline in use
 REACH = 0.6  # baseline over range up to which a reference takes part: it looks alike
 _UNSEEN = 20  # cost of a level for a reference that takes no part
@@ -57,7 +58,7 @@ class _Seen(NamedTuple):
 
 
 def levels(baselines: Sequence[float], pixel: float, step: float = _LEVEL,
-           nearest: float = 1 / _NEAREST) -> Floats:
+           nearest: float = math.inf) -> Floats:
     """Inverse ranges (N,), 1/m, at even steps of parallax of the longest baseline that sees well.
 
     The first two are beyond infinity: what lies at infinity has neighbours on both sides.
@@ -66,7 +67,7 @@ def levels(baselines: Sequence[float], pixel: float, step: float = _LEVEL,
     """
     longest_first = sorted(baselines, reverse=True)
     found = [-2 * step * pixel / longest_first[0]]
-    nearest = min(nearest, 1 / _NEAREST, _CLOSEST / longest_first[-1])
+    nearest = min(nearest, _CLOSEST / longest_first[-1])
     while found[-1] < nearest and len(found) < MOST_LEVELS:
         usable = [b for b in longest_first if found[-1] * b <= REACH] or longest_first[-1:]
         near = found[-1] * usable[0] > REACH
