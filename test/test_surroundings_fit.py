@@ -1,6 +1,8 @@
 """The network of what is round about, while it is fitted: runs where torch and onnx are."""
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,13 @@ def test_a_fit_completes():
     assert np.median(np.abs(larger[:, 4:28] - 0.5)) < 0.1
     assert np.median(np.abs(larger[:, 36:60] - 1.5)) < 0.1
     assert np.median(likely) < 0.2
+
+
+def test_nothing_is_fitted_to_what_is_not_known():
+    x, nothing = np.zeros((CHANNELS, 64, 64)), np.zeros((128, 128))
+    unknown = replace(patch_of(x, nothing), weight=nothing.astype(np.float16))
+    with pytest.raises(ValueError, match='truth'):
+        fit([unknown], 1, np.random.default_rng(0))
 
 
 def test_one_that_saw_less_goes_on():

@@ -236,8 +236,14 @@ def _drawn(patches: Sequence[Patch], rng: np.random.Generator) -> tuple[Any, ...
 
 def fit(patches: Sequence[Patch], steps: int, rng: np.random.Generator,
         start: dict[str, NDArray[np.float32]] | None = None) -> Parameters:
-    """Weights after so many steps, from `start` if there is one."""
-    return DESIGN.fitted(lambda: _drawn(patches, rng), loss, steps, _BATCH, start, _RATE)
+    """Weights after so many steps, from `start` if there is one.
+
+    Raises ValueError where of no patch enough of the truth is known.
+    """
+    known = [p for p in patches if p.weight.mean(dtype=np.float64) > _TRUE]
+    if not known:
+        raise ValueError('of no patch enough of the truth is known')
+    return DESIGN.fitted(lambda: _drawn(known, rng), loss, steps, _BATCH, start, _RATE)
 
 
 def main() -> None:

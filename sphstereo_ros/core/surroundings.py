@@ -34,7 +34,7 @@ _LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24, *range(25, 43))  # of the inp
 
 @fast_kernel
 def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
-           others: NDArray[np.float32], told: NDArray[np.float32], units: Map, sine: Map,
+           others: tuple[Map, ...], told: NDArray[np.float32], units: Map, sine: Map,
            scale: Map, h: int, w: int, x: Map, p: int) -> None:  # pragma: no cover - compiled
     """Fill column p of `x` (CHANNELS, pixels) of the pixel (h, w) at half size, before logarithms.
     """
@@ -64,10 +64,10 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
         information += full[4, r, c] * unit * unit
         longest += pixels * scale[2]
         sines += s
-        x[25 + n, p] = np.float32(2) + others[0, r, c]
-        x[29 + n, p] = np.float32(2) + others[1, r, c]
-        x[33 + n, p] = np.float32(2) + others[3, r, c]
-        x[38 + n, p] = np.float32(2) + others[5, r, c]
+        x[25 + n, p] = np.float32(2) + others[0][r, c]
+        x[29 + n, p] = np.float32(2) + others[1][r, c]
+        x[33 + n, p] = np.float32(2) + others[3][r, c]
+        x[38 + n, p] = np.float32(2) + others[5][r, c]
     x[4, p], x[9, p] = quarter * nearer, quarter * sign
     x[14, p] = np.float32(0.5) + half[12, h, w]
     x[15, p] = np.float32(0.1) + quarter * swept
@@ -78,13 +78,13 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
     x[22, p], x[23, p] = quarter * sines, high - low
     x[24, p] = np.float32(0.05) + half[13, h, w]
     for k in range(2):
-        share = others[2 + 2 * k, 2 * h, 2 * w] / units[2 * h, 2 * w]
+        share = others[2 + 2 * k][2 * h, 2 * w] / units[2 * h, 2 * w]
         x[37 + 5 * k, p] = np.float32(1.1) + min(max(share, -one), np.float32(20))
 
 
 @fast_kernel
 def _input_rows(first: int, last: int, view: Image8, full: NDArray[np.float32],
-                half: NDArray[np.float32], others: NDArray[np.float32],
+                half: NDArray[np.float32], others: tuple[Map, ...],
                 told: NDArray[np.float32], units: Map, sine: Map, scale: Map, wrap: int,
                 out: NDArray[np.float32]) -> None:  # pragma: no cover - compiled
     """Rows of `out` (1, CHANNELS, …): half size, on round the sphere, at the end as the last.
@@ -131,9 +131,9 @@ def inputs(view: Image8, seen: Look, others: Alternatives, told: NDArray[np.floa
     rows, columns = seen.half.shape[1:]
     size = [-(-n // BLOCK) * BLOCK for n in (rows + 2 * _ROUND, columns)]
     out = np.empty((1, CHANNELS, *size), np.float32)
-    stacked = np.stack([others.least, others.most, others.near, others.near_least, others.far,
-                        others.far_least])
-    rows_in_parallel(_input_rows, size[0], view, seen.full, seen.half, stacked, told, unit,
+    maps = (others.least, others.most, others.near, others.near_least, others.far,
+            others.far_least)
+    rows_in_parallel(_input_rows, size[0], view, seen.full, seen.half, maps, told, unit,
                      *_geometry(grid, baselines), grid.wrap // 2, out)
     return out
 
