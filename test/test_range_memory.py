@@ -79,6 +79,19 @@ class Ahead(Camera):
         return self.tells(key, seen, last, **more)
 
 
+class Across(Camera):
+    """Goes to and fro across a hollow sphere, and measures it: everything beside moves far."""
+
+    truth: np.ndarray
+
+    def sees(self, share: np.ndarray | float = 1.0, sigma: float = 0.02) -> Remembered:
+        """What is true times `share`."""
+        last = list(self.places)[-1] if self.places else self.moves([-1, 0, 0])
+        place = np.array([2.0 * (len(self.places) % 2) - 1, 0, 0])
+        self.truth = exact(Ball(radius=5.0), place, np.eye(3), HEIGHT)
+        return self.tells(self.moves(place), measurement(self.truth * share, sigma=sigma), last)
+
+
 def known(found: Remembered) -> np.ndarray:
     return found.sigma < NOTHING
 
@@ -130,25 +143,39 @@ def test_evidence_grows_by_one_a_frame_to_six():
 
 
 def test_frames_that_agree_are_averaged_by_their_variance():
-    camera = Ahead()
-    first = camera.sees(measurement(NEAR, sigma=0.02))
-    second = camera.sees(measurement(1.03 * NEAR, sigma=0.01))
-    assert NEAR < np.median(second.rho) < 1.03 * NEAR
-    assert np.median(second.rho) > 1.02 * NEAR  # the newer is the more certain
-    assert (second.sigma < 0.01 * 1.03 * NEAR).all()
-    assert (second.sigma > 0.3 * first.sigma).all()
+    camera = Across()
+    first = camera.sees(sigma=0.02)
+    second = camera.sees(1.03, sigma=0.01)
+    share = np.median(second.rho / camera.truth)
+    assert 1.02 < share < 1.03  # the newer is the more certain
+    assert np.median(second.sigma / camera.truth) < 0.01 * 1.03
+    assert np.median(second.sigma) > 0.3 * np.median(first.sigma)
 
 
 def test_many_frames_with_errors_of_their_own_come_nearer_to_the_truth():
-    rng, camera = np.random.default_rng(0), Ahead()
+    rng, camera = np.random.default_rng(0), Across()
     errors = []
     for _ in range(12):
-        noise = 1 + 0.02 * rng.normal(size=(HEIGHT, 2 * HEIGHT))
-        found = camera.sees(measurement(NEAR * noise))
-        errors.append(np.sqrt(np.mean((found.rho / NEAR - 1)[known(found)]**2)))
+        found = camera.sees(1 + 0.05 * rng.normal(size=(HEIGHT, 2 * HEIGHT)), sigma=0.05)
+        errors.append(np.sqrt(np.mean((found.rho / camera.truth - 1)[known(found)]**2)))
     assert errors[-1] < 0.6 * errors[0]
-    z = np.abs(found.rho - NEAR)[4:-4] / found.sigma[4:-4]
+    z = np.abs(found.rho - camera.truth)[known(found)] / found.sigma[known(found)]
     assert 0.5 < np.median(z) < 0.9  # of a normal distribution: 0.67
+
+
+def test_frames_in_which_hardly_anything_moves_err_alike():
+    """However many there are, sigma is that of one; the poles of the motion hardly move at all."""
+    rng, still, across = np.random.default_rng(0), Ahead(), Across()
+    error = 1 + 0.02 * rng.normal(size=(HEIGHT, 2 * HEIGHT))
+    for _ in range(12):
+        alike = still.sees(measurement(NEAR * error))
+        moved = across.sees()
+    z = np.abs(alike.rho - NEAR) / alike.sigma
+    assert 0.5 < np.median(z) < 0.7
+    share = moved.sigma / across.truth / 0.02  # of one frame's
+    pole, equator = share[HEIGHT // 2 - 1, 3 * HEIGHT // 2 - 1], share[4:-4, HEIGHT]
+    assert pole > 0.9
+    assert (equator < 0.8).all()
 
 
 def test_sigma_has_a_floor_however_long_it_looks():
@@ -409,6 +436,25 @@ def test_what_is_nearer_hides_what_is_farther():
     assert inside.sum() > 100
     assert known(found)[inside].mean() > 0.75
     assert (found.rho > 0.9 * truth)[inside & known(found)].all()
+
+
+@pytest.mark.parametrize('pixels', [0.3, 0.5, 0.8])
+def test_of_one_surface_not_the_nearest_is_kept(pixels):
+    """Of two pixels that fall on one, the nearer errs towards the camera as a rule."""
+    rng, camera = np.random.default_rng(0), Camera()
+    noisy = NEAR * (1 + 0.02 * rng.normal(size=(HEIGHT, 2 * HEIGHT)))
+    last = camera.moves([0, 0, 0])
+    for n in range(1, 5):
+        key = camera.moves([0, 0, 1e-4 * n])
+        camera.tells(key, measurement(noisy), last)
+        last = key
+    key = camera.moves([0, 0, 0], rotations.exp(np.array([0, pixels * np.pi / HEIGHT, 0])))
+    found = camera.tells(key, measurement(NEAR, frames=0, sigma=1e3, told=1e3), last)
+    row = np.s_[HEIGHT // 2 - 8:HEIGHT // 2 + 8]
+    assert known(found)[row].mean() > 0.9
+    error = (found.rho / NEAR - 1)[row][known(found)[row]]
+    assert abs(error.mean()) < 0.2 * 0.02
+    assert error.std() == pytest.approx(0.02, rel=0.1)
 
 
 def test_sigma_is_that_of_the_moved_range():

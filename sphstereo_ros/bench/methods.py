@@ -10,6 +10,8 @@ from .processes import shipped
 
 MATCHERS = ('hybrid', 'flow', 'flow_fast', 'bm', 'bm_judged', 'sgbm')
 ONE_REFERENCE: Mapping[str, object] = {'pairing.intervals': [1]}
+# Matchers without memory tell the error of one frame; the shipped files with such have the same.
+_NO_MEMORY: Mapping[str, object] = {'range.max_relative_sigma': 0.3}
 
 
 @dataclass(frozen=True)
@@ -46,11 +48,11 @@ def method(name: str, overrides: Mapping[str, object] | None = None) -> Method:
     if name == 'paper':
         return Method({**ONE_REFERENCE, **_file('config/paper.yaml')})
     if name == 'sgbm_true_pose':
-        return Method({**ONE_REFERENCE, 'stereo.matcher': 'sgbm'}, true_pose=True)
+        return Method({**ONE_REFERENCE, **_NO_MEMORY, 'stereo.matcher': 'sgbm'}, true_pose=True)
     if name == 'one_reference':
         return Method(ONE_REFERENCE, remembers=True)
     if name in {'live', 'live_checked'}:
         return Method(_file(f'config/{name}.yaml'), remembers=True)
     if name in MATCHERS:
-        return Method({'stereo.matcher': name}, remembers=True)
+        return Method({**_NO_MEMORY, 'stereo.matcher': name}, remembers=True)
     return Method(overrides or {}, remembers=True)

@@ -5,6 +5,9 @@ Where they agree they are averaged and evidence grows; where nothing confirms it
 and what is contradicted goes at once or within a few frames. What is measured there but not
 believed contradicts, too, if it is something else: a thing that came before what is remembered
 looks like that. A pixel is published when enough frames bear it out.
+
+Averaging makes sigma smaller only as far as errors differ: what is far has hardly moved in the
+picture from frame to frame, so the same windows match it, and err alike.
 """
 from __future__ import annotations
 
@@ -26,7 +29,9 @@ _CONTRADICTED, _UNCONFIRMED, _UNTOLD = 2.0, 1.0, 0.3  # what a frame takes away 
 _DOUBTED = 3.0  # evidence is no more than that where the newest frame is not believed
 _AGREES, _SAME = 3.0, 0.02  # standard deviations, or share of the inverse range
 _CONFIRMS, _AGAIN, _BLIND = 0.3, 0.05, 0.05  # shares of it
-_GROWTH = 1.25  # of sigma from frame to frame: errors of consecutive frames are much alike
+_GROWTH = 1.25  # of sigma from frame to frame
+_MOVES = 2.0  # px that something moves in the picture until the errors' correlation is an e-th
+_SURFACE = 1.0  # standard deviations: within, what moves to one pixel is one surface
 _PUBLISHED = 2.0  # evidence that is enough
 
 
@@ -41,38 +46,49 @@ class Remembered:
 
 @fast_kernel
 def _place_rows(first: int, last: int, old_rho: Map, cos_lat: Map, sin_lat: Map, cos_lon: Map,
-                sin_lon: Map, pose: Map, column: Map, row: Map,
-                scale: Map) -> None:  # pragma: no cover - compiled
-    """Where the current camera sees every pixel, and its inverse range as a multiple."""
+                sin_lon: Map, pose: Map, column: Map, row: Map, scale: Map,
+                alike: Map) -> None:  # pragma: no cover - compiled
+    """Where the current camera sees every pixel, its inverse range as a multiple, and how much the
+    errors of both frames are alike there.
+    """
     height, width = old_rho.shape
+    per_move = np.float32(height / (np.pi * _MOVES))
     per_u, per_v = np.float32(width / (2 * np.pi)), np.float32(height / np.pi)
     left, top = np.float32(0.5 * width - 0.5), np.float32(0.5 * height - 0.5)
     for i in range(first, last):
         for j in range(width):
             r = old_rho[i, j]
-            a, b, c = cos_lat[i] * sin_lon[j], -sin_lat[i], cos_lat[i] * cos_lon[j]
-            x = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c + r * pose[0, 3]
-            y = pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c + r * pose[1, 3]
-            z = pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c + r * pose[2, 3]
+            right, down, ahead = cos_lat[i] * sin_lon[j], -sin_lat[i], cos_lat[i] * cos_lon[j]
+            a = pose[0, 0] * right + pose[0, 1] * down + pose[0, 2] * ahead
+            b = pose[1, 0] * right + pose[1, 1] * down + pose[1, 2] * ahead
+            c = pose[2, 0] * right + pose[2, 1] * down + pose[2, 2] * ahead
+            x, y, z = a + r * pose[0, 3], b + r * pose[1, 3], c + r * pose[2, 3]
             level = x * x + z * z
             scale[i, j] = np.float32(1) / np.sqrt(level + y * y)
+            across = (y * c - z * b)**2 + (z * a - x * c)**2 + (x * b - y * a)**2
+            move = np.sqrt(across) * scale[i, j]  # rad; what rotation moves shows the same
+            alike[i, j] = np.exp(-move * per_move)
             column[i, j] = _arctan2(x, z) * per_u + left
             row[i, j] = _arctan2(y, np.sqrt(level)) * per_v + top
 
 
 @kernel
-def _splat(old_rho: Map, old_sigma: Map, old_evidence: Map, at_column: Map, at_row: Map,
-           scale: Map, rho: Map, sigma: Map,
-           evidence: Map) -> None:  # pragma: no cover - compiled
-    """Every known pixel to where it is seen; what is nearest hides the rest."""
-    height, width = old_rho.shape
-    least = np.float32(0.2)
+def _splat(old: tuple[Map, ...], at_column: Map, at_row: Map, scale: Map,
+           new: tuple[Map, ...]) -> None:  # pragma: no cover - compiled
+    """Every known pixel to where it is seen. What is nearest hides the rest; of one surface, what
+    is seen closest to the pixel's centre counts: the nearest would be what errs most.
+
+    old, new : inverse range, its standard deviation, evidence, how much errors are alike
+    """
+    rho, sigma = new[0], new[1]
+    height, width = rho.shape
+    least, share = np.float32(0.2), np.zeros(rho.shape, np.float32)
     for i in range(height):
         for j in range(width):
-            if old_sigma[i, j] >= NOTHING:
+            if old[1][i, j] >= NOTHING:
                 continue
             per_n = scale[i, j]
-            moved, spread = old_rho[i, j] * per_n, old_sigma[i, j] * per_n * per_n
+            moved, spread = old[0][i, j] * per_n, old[1][i, j] * per_n * per_n
             u, v = at_column[i, j] + 1, at_row[i, j] + 1  # not negative
             u0, v0 = np.int32(u), np.int32(v)
             fu, fv = u - np.float32(u0), v - np.float32(v0)
@@ -82,15 +98,19 @@ def _splat(old_rho: Map, old_sigma: Map, old_evidence: Map, at_column: Map, at_r
                     continue
                 wv = fv if dv else 1 - fv
                 for du in range(2):
-                    if wv * (fu if du else 1 - fu) < least:
+                    here = wv * (fu if du else 1 - fu)
+                    if here < least:
                         continue
                     column = u0 + du - 1
                     column = column + width if column < 0 else column
                     column = column - width if column >= width else column
-                    if sigma[row, column] >= NOTHING or moved > rho[row, column]:
-                        rho[row, column] = moved
-                        sigma[row, column] = spread
-                        evidence[row, column] = old_evidence[i, j]
+                    nearer = moved - rho[row, column]
+                    same = np.float32(_SURFACE) * min(spread, sigma[row, column])
+                    if sigma[row, column] >= NOTHING or nearer > same or (
+                            nearer > -same and here > share[row, column]):
+                        rho[row, column], sigma[row, column] = moved, spread
+                        new[2][row, column], new[3][row, column] = old[2][i, j], old[3][i, j]
+                        share[row, column] = here
 
 
 @kernel
@@ -109,7 +129,7 @@ def _doubted(level: float, found_again: bool, blind: bool,
 
 @kernel
 def _update_rows(first: int, last: int, new_rho: Map, new_sigma: Map, told: Map, frames: Evidence,
-                 fade: float, rho: Map, sigma: Map,
+                 fade: float, alike: Map, rho: Map, sigma: Map,
                  evidence: Map) -> None:  # pragma: no cover - compiled
     """The moved memory (rho, sigma, evidence) becomes the new one, pixel by pixel."""
     for i in range(first, last):
@@ -128,7 +148,8 @@ def _update_rows(first: int, last: int, new_rho: Map, new_sigma: Map, told: Map,
             if same and (counts > 0 or again):
                 w, w_new = 1 / (s * s), 1 / (spread * spread)
                 rho[i, j] = (w * old + w_new * measured) / (w + w_new)
-                s = np.float32(1) / np.sqrt(w + w_new)
+                ours, theirs = w * s / (w + w_new), w_new * spread / (w + w_new)
+                s = np.sqrt(ours * ours + theirs * theirs + 2 * alike[i, j] * ours * theirs)
             # What could be anything confirms nothing.
             if same and counts > 0 and off < max(np.float32(_CONFIRMS) * old, 3 * before):
                 level += counts
@@ -167,10 +188,10 @@ class RangeMemory:
         """
         metric = all(r.pose.is_metric for r in references)
         frames = new.frames if vehicle is None else np.where(vehicle, np.int8(0), new.frames)
-        moved = self._moved(key, references, metric, new.rho.shape)
+        moved, alike = self._moved(key, references, metric, new.rho.shape)
         fade = self._fade(key)
         rows_in_parallel(_update_rows, len(new.rho), new.rho, new.sigma, new.told, frames, fade,
-                         moved.rho, moved.sigma, moved.evidence)
+                         alike, moved.rho, moved.sigma, moved.evidence)
         self._key, self._kept, self._metric = key, moved, metric
         self._frames += 1
         enough = (moved.evidence >= min(self._frames, _PUBLISHED)) & (frames >= 0)
@@ -190,10 +211,13 @@ class RangeMemory:
         return _MOST * (key.stamp - self._key.stamp) * 1e-9 / self._seconds
 
     def _moved(self, key: FrameKey, references: tuple[Reference, ...], metric: bool,
-               shape: tuple[int, ...]) -> Remembered:
-        """What was kept, as the camera of frame `key` would see it; empty if that is unknown."""
+               shape: tuple[int, ...]) -> tuple[Remembered, Map]:
+        """What was kept, as the camera of frame `key` would see it, empty if that is unknown; and
+        the correlation of its errors with those of that frame.
+        """
         empty = Remembered(np.zeros(shape, np.float32), np.full(shape, NOTHING, np.float32),
                            np.zeros(shape, np.float32))
+        likeness = np.ones(shape, np.float32)
         if metric != self._metric:  # poses in metres and in steps make no chain
             self._history = PoseHistory()
         self._history.begin(key)
@@ -203,15 +227,15 @@ class RangeMemory:
         if pose is None or self._kept is None or self._kept.rho.shape != shape or (
                 metric != self._metric):
             self._frames = 0
-            return empty
+            return empty, likeness
         placed = np.column_stack([pose.rotation, pose.position]).astype(np.float32)
         kept = self._kept
-        column, row, scale = (np.empty(shape, np.float32) for _ in range(3))
+        column, row, scale, alike = (np.empty(shape, np.float32) for _ in range(4))
         rows_in_parallel(_place_rows, shape[0], kept.rho, *_grid_angles(shape[0]), placed, column,
-                         row, scale)
-        _splat(kept.rho, kept.sigma, kept.evidence, column, row, scale, empty.rho, empty.sigma,
-               empty.evidence)
-        return empty
+                         row, scale, alike)
+        _splat((kept.rho, kept.sigma, kept.evidence, alike), column, row, scale,
+               (empty.rho, empty.sigma, empty.evidence, likeness))
+        return empty, likeness
 
     def _pose_of_kept(self, key: FrameKey) -> RelativePose | None:
         if self._key is None or key <= self._key or (
