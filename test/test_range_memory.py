@@ -445,10 +445,11 @@ def test_of_one_surface_not_the_nearest_is_kept(pixels):
     noisy = NEAR * (1 + 0.02 * rng.normal(size=(HEIGHT, 2 * HEIGHT)))
     last = camera.moves([0, 0, 0])
     for n in range(1, 5):
-        key = camera.moves([0, 0, 1e-4 * n])
+        key = camera.moves([0, 0, 2e-3 * n])
         camera.tells(key, measurement(noisy), last)
         last = key
-    key = camera.moves([0, 0, 0], rotations.exp(np.array([0, pixels * np.pi / HEIGHT, 0])))
+    key = camera.moves([0, 0, 0], rotations.exp(
+        np.array([0, pixels * np.pi / HEIGHT, 0])))
     found = camera.tells(key, measurement(NEAR, frames=0, sigma=1e3, told=1e3), last)
     row = np.s_[HEIGHT // 2 - 8:HEIGHT // 2 + 8]
     assert known(found)[row].mean() > 0.9

@@ -31,7 +31,7 @@ _AGREES, _SAME = 3.0, 0.02  # standard deviations, or share of the inverse range
 _CONFIRMS, _AGAIN, _BLIND = 0.3, 0.05, 0.05  # shares of it
 _GROWTH = 1.25  # of sigma from frame to frame
 _MOVES = 2.0  # px that something moves in the picture until the errors' correlation is an e-th
-_SURFACE = 1.0  # standard deviations: within, what moves to one pixel is one surface
+_SURFACE = 2.0  # standard deviations: within, what moves to one pixel is one surface
 _PUBLISHED = 2.0  # evidence that is enough
 
 
