@@ -14,6 +14,10 @@ from sphstereo_ros.core.reliability import LEAST
 RHO = 0.5  # 1/m, measured
 GUESS = 0.4
 PIXEL = GRID.pixel / np.maximum(np.abs(np.sin(GRID.theta())), 0.02)  # rad across the motion
+THETA = GRID.theta()
+# px of parallax of what is completed, of the nearest reference
+SHIFT = (THETA - np.arctan2(np.sin(THETA), np.cos(THETA) + GUESS * BASELINES[0])) / GRID.pixel
+SEEN = SHIFT > 1.1
 VIEW = np.full(GRID.shape, 100, np.uint8)
 
 
@@ -42,7 +46,9 @@ def judged_with(monkeypatch, likely: float, completed: float, nearer: float = 0.
         told(likely), larger, told(completed, completed, nearer)]))
     judged = by_looks(Found(VIEW, *pictures, refined, rho, matched, parallax),
                       others_of(refined), GRID, BASELINES)
-    return Judged(*(m[1::2] for m in (judged.rho, judged.other, judged.error, judged.frames)))
+    assert (judged.rho == RHO)[1::2, SHIFT < 0.8].all()
+    return Judged(*(m[1::2, SEEN] for m in (judged.rho, judged.other, judged.error,
+                                            judged.frames)))
 
 
 @pytest.mark.parametrize(('likely', 'completed', 'taken'), [
@@ -52,7 +58,7 @@ def test_the_likelier_stands(monkeypatch, likely, completed, taken):
     np.testing.assert_allclose(judged.rho, GUESS if taken else RHO, rtol=1e-3)
     if taken:
         assert (judged.frames == 1).all()
-        error = completed * np.maximum(GUESS, PIXEL / BASELINES[1])
+        error = completed * np.maximum(GUESS, PIXEL / BASELINES[1])[SEEN]
         np.testing.assert_allclose(judged.error, np.broadcast_to(error, judged.rho.shape),
                                    rtol=0.05)
 
@@ -84,16 +90,21 @@ def test_what_the_reference_contradicts_is_not_completed(monkeypatch, differs, t
 
 def test_the_reference_is_asked_where_it_would_be_seen(monkeypatch):
     """A ramp of grey, that in the reference lies where the parallax takes it."""
-    theta, column = GRID.theta(), np.arange(GRID.shape[1])
-    before = np.arctan2(np.sin(theta), np.cos(theta) + GUESS * BASELINES[0])
-    at = column - (theta - before) / GRID.pixel
+    column = np.arange(GRID.shape[1])
+    at = column - SHIFT
     sphere = slice(GRID.margin, -GRID.margin)  # beyond it, angles run back
     ramp, moved = (np.broadcast_to(np.rint(r), GRID.shape).astype(np.uint8)
                    for r in (3 * column, np.interp(column, at[sphere], 3 * column[sphere])))
-    inside = np.sin(theta) > 0.95
+    inside = np.sin(THETA)[SEEN] > 0.95
     for there, taken in ((moved, 1), (ramp, 0)):
         judged = judged_with(monkeypatch, 0.9, 0.02, pictures=(ramp, there))
         assert (judged.frames[:, inside] == taken).all()
+
+
+def test_what_the_nearest_reference_could_not_show_is_not_completed(monkeypatch):
+    """With less than a pixel of parallax it shows the same whatever is there (see judged_with)."""
+    assert 0 < SEEN.mean() < (SHIFT > 0.8).mean() < 1
+    assert (judged_with(monkeypatch, 0.9, 0.02).frames == 1).all()
 
 
 def test_where_nothing_is_known_round_about_nothing_is_completed(monkeypatch):

@@ -31,9 +31,10 @@ _PLAIN = 0.3  # of the unit: with a smaller likely error it counts for two frame
 _NEARER, _VEILED = 0.6, 1.2
 _TAIL = 0.75  # of what is published
 # What is completed counts with such a likely error, in its unit, where what was measured is less
-# likely, and differs by such a share; not where the reference shows something else, nor where less
-# than such a share of what is round about (of the grid's height) is sure.
-_SURE_COMPLETED, _DIFFERS = 0.2, 0.03
+# likely, and differs by such a share; not where the nearest reference shows something else, or has
+# fewer px of parallax and shows the same whatever is there, nor where less than such a share of what
+# is round about (of the grid's height) is sure.
+_SURE_COMPLETED, _DIFFERS, _SHOWS = 0.2, 0.03, 1.0
 _AMID, _ROUND = 0.15, 1 / 15
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
@@ -137,7 +138,8 @@ def _complete_rows(first: int, last: int, view: Image8, before: Image8,
                     (there + nearer * unit[i, j]) * np.float32(NEAR_BY) * scale[1] > 1):
                 continue
             moved = _arctan2(np.sin(theta[j]), np.cos(theta[j]) + there * scale[1])
-            if not shows_the_same(view, before, i, j, (theta[j] - moved) / scale[0]):
+            pixels = (theta[j] - moved) / scale[0]
+            if pixels < np.float32(_SHOWS) or not shows_the_same(view, before, i, j, pixels):
                 continue
             rho[i, j], error[i, j], frames[i, j] = there, spread, np.int8(1)
 
