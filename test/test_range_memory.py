@@ -178,6 +178,17 @@ def test_frames_in_which_hardly_anything_moves_err_alike():
     assert (equator < 0.8).all()
 
 
+@pytest.mark.parametrize(('scale', 'rho', 'sigma', 'told'), [
+    (1.0, 0.1, 0.35, False), (1.0, 0.1, 0.25, True), (1.0, 0.02, 0.35, True),
+    (UNSCALED / 0.5, 0.1, 0.35, False), (UNSCALED / 0.5, 0.02, 0.35, True)])
+def test_nothing_uncertain_is_told_to_be_near_by(scale, rho, sigma, told):
+    """Nearer than 40 baselines, of 0.5 m; also where metres are unknown."""
+    camera, unit = Camera(), 1.0 if scale == 1.0 else 0.5
+    keys = [camera.moves([0, 0, 0.5 * n]) for n in range(2)]
+    found = camera.tells(keys[1], measurement(rho * unit, sigma=sigma), keys[0], scale=scale)
+    assert (known(found) == told).all()
+
+
 def test_sigma_has_a_floor_however_long_it_looks():
     """Errors of consecutive frames are much alike."""
     camera = practised(30)

@@ -22,6 +22,7 @@ from .inverse_range import NOTHING, _grid_angles
 from .jit import fast_kernel, kernel, rows_in_parallel
 from .joint import Measurement, in_steps
 from .judgement import Evidence
+from .reliability import NEAR_BY
 from .warp import Map, _arctan2
 
 _MOST = 6.0  # evidence
@@ -33,6 +34,7 @@ _GROWTH = 1.25  # of sigma from frame to frame
 _MOVES = 2.0  # px that something moves in the picture until the errors' correlation is an e-th
 _SURFACE = 2.0  # standard deviations: within, what moves to one pixel is one surface
 _PUBLISHED = 2.0  # evidence that is enough
+_UNSURE = 0.3  # of the range: with a larger sigma nothing is told to be near by
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,8 @@ class RangeMemory:
               vehicle: NDArray[np.bool_] | None = None) -> Remembered:
         """Memory and the new measurement of frame `key` as one; it is the memory from now on.
 
-        The result has only what enough frames bear out.
+        The result has only what enough frames bear out, and nothing near by (`NEAR_BY` baselines)
+        that is uncertain.
         """
         metric = all(r.pose.is_metric for r in references)
         frames = new.frames if vehicle is None else np.where(vehicle, np.int8(0), new.frames)
@@ -195,6 +198,9 @@ class RangeMemory:
         self._key, self._kept, self._metric = key, moved, metric
         self._frames += 1
         enough = (moved.evidence >= min(self._frames, _PUBLISHED)) & (frames >= 0)
+        shortest = min(in_steps(r.pose).baseline for r in references)
+        near_by = moved.rho * np.float32(NEAR_BY * shortest) > 1
+        enough &= ~near_by | (moved.sigma < np.float32(_UNSURE) * moved.rho)
         return Remembered(moved.rho, np.where(enough, moved.sigma, np.float32(NOTHING)),
                           moved.evidence)
 
