@@ -11,7 +11,7 @@ import pytest
 from analytic_world import View, World, look, true_pose, window
 from two_views import angle_between
 
-from sphstereo_ros.core import rotations, stereo
+from sphstereo_ros.core import rotations
 from sphstereo_ros.core.alignment import Aligner
 from sphstereo_ros.core.camera import Equirectangular
 from sphstereo_ros.core.config import PARAMETERS, resolve
@@ -86,9 +86,12 @@ def measured(current: View, *references: tuple[View, RelativePose],
 
 @cache
 def ranged(matcher: str = 'flow', motion: str = 'forward', turn: tuple = (0, 0, 0)) -> RangeImage:
-    """Range of the room with the true pose; the current camera turned by `turn`."""
+    """Range of the room with the true pose; the current camera turned by `turn`. It is as certain
+    as the files ask for that are shipped for matchers without memory.
+    """
     current, reference = seen(turn=turn), before(motion)
-    return measured(current, (reference, exact(reference, current)), stereo__matcher=matcher)
+    return measured(current, (reference, exact(reference, current)), stereo__matcher=matcher,
+                    range__max_relative_sigma=0.3)
 
 
 def relative_error(got: RangeImage, view: View) -> np.ndarray:
@@ -508,12 +511,10 @@ def test_the_blind_cone_is_unknown_on_both_sides(motion):
 
 @pytest.mark.parametrize('matcher', [m for m in MATCHERS if m != 'flow_fast'])  # it is too noisy
 @pytest.mark.parametrize('columns', [85, 140, HEIGHT])
-def test_the_seam_is_matched_like_the_rest(monkeypatch, matcher, columns):
+def test_the_seam_is_matched_like_the_rest(matcher, columns):
     """Turned, the camera has its seam elsewhere: the same walls have the same range and error."""
-    # Far patches that near surfaces frame are unknown as a whole or not at all: one pixel decides.
-    monkeypatch.setattr(stereo, 'far_islands', lambda r: np.zeros(r.shape, np.bool_))
     turn = (0, columns * np.pi / HEIGHT, 0)
-    straight, turned = (ranged.__wrapped__(matcher, turn=t) for t in ((0, 0, 0), turn))
+    straight, turned = ranged(matcher), ranged(matcher, turn=turn)
     known = np.roll(np.isfinite(straight.range), -columns, axis=1)
     before_ = np.roll(relative_error(straight, seen()), -columns, axis=1)
     now = relative_error(turned, seen(turn=turn))

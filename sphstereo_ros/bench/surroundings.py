@@ -55,9 +55,9 @@ _ROWS, _COLUMNS, _BATCH, _RATE = 192, 256, 3, 1e-3
 _TRUE = 0.02  # share of a sample of which the truth has to be known
 _LARGE, _OFTEN = 600, 0.5  # rows at half size of a patch that is drawn so often at least
 
-_TOLD = len(PERCENTILES)
+_OF_ERROR = len(PERCENTILES)
 DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
-                [_BEGIN] * (4 * _TOLD) + [0.0] * 4 + [_BEGIN] * (4 * _TOLD))
+                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * 4 + [_BEGIN] * (4 * _OF_ERROR))
 
 
 @dataclass(frozen=True)
@@ -178,13 +178,13 @@ def loss(out: Any, measured: Any, error: Any, true: Any, weight: Any, ratio: flo
     import torch
     from torch.nn import functional
     told = functional.pixel_shuffle(out, 2)
-    completed = told[:, _TOLD:_TOLD + 1] + measured
+    completed = told[:, _OF_ERROR:_OF_ERROR + 1] + measured
     pixels = torch.exp(completed.detach()) - float(ADDED)
     off = (torch.exp(true) - float(ADDED) - pixels) / pixels.clamp(min=ratio)
 
     def of(percentiles: Any, error: Any) -> Any:
         return percentile_loss(percentiles, error, weight, LEAST, MOST, PERCENTILES)
-    return (of(told[:, :_TOLD], error) + of(told[:, _TOLD + 1:], off)
+    return (of(told[:, :_OF_ERROR], error) + of(told[:, _OF_ERROR + 1:], off)
             + (weight * (true - completed).abs()).sum() / weight.sum())
 
 
