@@ -250,6 +250,24 @@ def test_what_could_hide_a_body_makes_the_wall_behind_unknown() -> None:
     assert detect(image, hidden_width=0.0).state[at] == SectorState.MEASURED
 
 
+def test_what_could_hide_a_post_makes_the_wall_behind_unknown() -> None:
+    image = seen(wall(10.0), floor(1.2))
+    columns = slice(HEIGHT - 4, HEIGHT + 4)  # 3°: 0.15 m at 2.9 m
+    image.range[HEIGHT // 2 - 60:HEIGHT // 2 + 60, columns] = np.nan
+    at = sector_of(1, 0)
+    assert detect(image).state[at] == SectorState.UNKNOWN
+    assert detect(image, hidden_width=0.0).state[at] == SectorState.MEASURED
+    image = seen(wall(10.0), floor(1.2))
+    image.range[HEIGHT // 2 - 60:HEIGHT // 2 + 60, HEIGHT:HEIGHT + 1] = np.nan
+    assert detect(image).state[at] == SectorState.MEASURED
+
+
+def test_a_low_edge_in_the_band_is_told_not_the_wall_behind() -> None:
+    out = detect(seen(floor(1.6), wall(12.0), post(3.0, 0, 0.6, high=-0.98)), height_below=1.0)
+    for sector in (sector_of(1, 0), sector_of(1, 0.1)):
+        assert out.distance[sector] == pytest.approx(2.4, rel=0.05)
+
+
 def test_plain_sky_is_unknown_unless_it_is_trusted() -> None:
     image = seen(floor(1.5), wall(30.0))
     lat = 90 - (np.arange(HEIGHT) + 0.5) / HEIGHT * 180

@@ -16,7 +16,7 @@ _ALIKE = 1.1  # ratio of the distances of neighbours that belong together
 # The smallest thing that is believed: m² that face the camera, and pixels; and what of it a
 # column must show: so many m², or pixels of its whole width up to such a height (m).
 _AREA, _PIXELS = 0.015, 6
-_AREA_IN_COLUMN, _HEIGHT_IN_COLUMN, _PIXELS_IN_COLUMN = 0.003, 0.1, 3
+_AREA_IN_COLUMN, _HEIGHT_IN_COLUMN, _PIXELS_IN_COLUMN = 0.003, 0.03, 3
 _QUANTILE = 0.1  # of a thing's pixels in a column are nearer than what is told
 _STEP = 0.005  # relative width of the bins of distance
 

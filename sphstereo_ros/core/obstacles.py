@@ -30,9 +30,11 @@ from .warp import Map
 Floats = NDArray[np.float64]
 
 # A sector is free where no pole could stand unseen. It is measured where nothing could that is as
-# wide as `obstacles.hidden_width`, at less than _BEFORE of the distance that is measured.
+# wide as `obstacles.hidden_width`, nor a post, at less than _BEFORE of the distance that is
+# measured.
 _POLE = Hidden(0.15, 0.5, 10.0, 0.75, False)
 _BODY = Hidden(1.0, 0.4, 10.0, 0.15, True, nearest=2.0)
+_POST = Hidden(0.15, 1.2, 10.0, 0.15, True, nearest=2.0)
 _BEFORE = 0.6
 # m above the band that must be free, too: a crown that begins there has leaves below it.
 _OVER = 0.5
@@ -120,7 +122,8 @@ class _Picture:
             limits, height_above=limits.height_above + _OVER)))
         hidden = np.full(SECTORS, np.inf)
         if limits.hidden_width > 0:
-            hidden = place(replace(_BODY, width=limits.hidden_width), limits)
+            hidden = np.minimum(place(replace(_BODY, width=limits.hidden_width), limits),
+                                place(_POST, limits))
         nearest, doubt, believed = nearest_things(
             flat, column, np.ascontiguousarray(self._angles[0][:, 0]), limits.minimum,
             limits.maximum, columns)
