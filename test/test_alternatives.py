@@ -7,7 +7,7 @@ from test_refinement import BALL, seen
 from sphstereo_ros.core.alternatives import alternatives
 from sphstereo_ros.core.refinement import JointRefinement
 
-SIZE = 15 // 2  # px that are round about
+SIZE, WIDE = 15 // 2, 31 // 2  # px that are round about, and more widely
 
 
 def refinement_of(view):
@@ -44,12 +44,13 @@ def test_nearest_and_farthest_round_about_without_specks():
     rho[100:, :] = 0.5
     rho[60, 60] = 9  # a speck
     found = alternatives(rho, refinement_of(view))
-    assert (found.near[50:70] == np.float32(0.2)).all()
-    near, far = 101 - SIZE, 99 + SIZE  # a row at a rim is a speck as well
-    assert (found.near[near:] == np.float32(0.5)).all()
-    assert (found.near[:near] == np.float32(0.2)).all()
-    assert (found.far[:far] == np.float32(0.2)).all()
-    assert (found.far[far:] == np.float32(0.5)).all()
+    assert (found.near.rho[50:70] == np.float32(0.2)).all()
+    near, far, farther = 101 - SIZE, 99 + SIZE, 99 + WIDE  # a row at a rim is a speck as well
+    assert (found.near.rho[near:] == np.float32(0.5)).all()
+    assert (found.near.rho[:near] == np.float32(0.2)).all()
+    for rim, other in ((far, found.far), (farther, found.farther)):
+        assert (other.rho[:rim] == np.float32(0.2)).all()
+        assert (other.rho[rim:] == np.float32(0.5)).all()
 
 
 def test_each_is_compared_with_the_references():
@@ -57,7 +58,8 @@ def test_each_is_compared_with_the_references():
     rho = np.full(view.grid.shape, 1 / BALL.radius, np.float32)
     rho[:, view.grid.shape[1] // 2:] *= 1.5
     found = alternatives(rho, refinement)
-    for value, least in ((rho, found.least), (found.near, found.near_least),
-                         (found.far, found.far_least)):
-        np.testing.assert_array_equal(least, refinement.agreement(value)[0])
-    np.testing.assert_array_equal(found.most, refinement.agreement(rho)[1])
+    np.testing.assert_array_equal(found.measured.rho, rho)
+    for other in (found.measured, found.near, found.far, found.farther):
+        least, most = refinement.agreement(other.rho)
+        np.testing.assert_array_equal(other.least, least)
+        np.testing.assert_array_equal(other.most, most)

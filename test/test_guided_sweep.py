@@ -74,7 +74,7 @@ def test_a_matcher_has_sharper_rims_than_its_windows(posts):
     refinement = JointRefinement(posts.image, grid, posts.axes, posts.pairs)
     known = refinement.refined(refinement.refined(fattened(truth), 9).rho, 9)
     matcher = JointMatcher('joint', lambda *_: pytest.fail('nothing to be matched'))
-    found = matcher._sharpened(posts.image, grid, posts.axes, posts.pairs, known)
+    found = matcher._sharpened(refinement, posts.pairs, known)
     assert wrong(found.rho, truth)[rim].mean() < 0.7 * wrong(known.rho, truth)[rim].mean()
 
 

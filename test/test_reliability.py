@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from sphstereo_ros.bench.reliability import HIDDEN, Fit, Samples, fit
 from sphstereo_ros.core import judgement
-from sphstereo_ros.core.alternatives import Alternatives
+from sphstereo_ros.core.alternatives import Alternative, Alternatives
 from sphstereo_ros.core.judgement import Found, by_looks
 from sphstereo_ros.core.matching import UNKNOWN, Parallax, stereo_grid
 from sphstereo_ros.core.refinement import Refined
@@ -46,7 +46,9 @@ def found(rng: np.random.Generator, scale: float = 1.0):
 def others_of(refined: Refined) -> Alternatives:
     """To what was measured, as differ from place to place as that."""
     rho, misfit = refined.rho, refined.misfit / 5
-    return Alternatives(0.3 * misfit, 1.1 * misfit, rho * 1.6, 0.9 * misfit, rho * 0.4, misfit)
+    return Alternatives(*(Alternative(share * rho, least * misfit, most * misfit) for
+                          share, least, most in ((1, 0.3, 1.1), (1.6, 0.9, 1.2), (0.4, 1, 1.3),
+                                                 (0.2, 0.8, 1.4))))
 
 
 def everywhere() -> tuple[np.ndarray, np.ndarray]:

@@ -54,6 +54,9 @@ def test_the_inputs_of_a_pixel(h, w):
 
     def grey_of(difference):
         return np.log(2 + difference[block].ravel()) - 2
+
+    def share_of(other):
+        return np.log(1.1 + min(other.rho[2 * h, 2 * w] / units[0, 0], 20))
     short, long = (units * b * sine / GRID.pixel for b in BASELINES)
     exact = [*np.maximum(told[0], told[1] - 1.3)[block].ravel(), mean(told[2][block]),
              *np.log(0.1 + short).ravel(), mean(np.clip(rho / units, -1, 1)), *grey.ravel(),
@@ -65,9 +68,11 @@ def test_the_inputs_of_a_pixel(h, w):
              0.2 * np.log(0.01 + mean(refined.information[block] * units**2)),
              0.5 * np.log(0.1 + mean(long)), mean(sine), np.ptp(grey),
              np.log(0.05 + seen.half[13, h, w]) + 1,
-             *grey_of(others.least), *grey_of(others.most), *grey_of(others.near_least),
-             np.log(1.1 + min(others.near[2 * h, 2 * w] / units[0, 0], 20)),
-             *grey_of(others.far_least), np.log(1.1 + others.far[2 * h, 2 * w] / units[0, 0])]
+             *grey_of(others.measured.least), *grey_of(others.measured.most),
+             *grey_of(others.near.least), share_of(others.near),
+             *grey_of(others.far.least), share_of(others.far),
+             *grey_of(others.near.most), *grey_of(others.far.most), *grey_of(others.farther.least),
+             *grey_of(others.farther.most), share_of(others.farther)]
     assert len(exact) == CHANNELS
     np.testing.assert_allclose(out[0, :, ROUND + h, w], exact, rtol=1e-4, atol=1e-4)
 

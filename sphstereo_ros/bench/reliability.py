@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from sphstereo_ros.core.config import resolve
-from sphstereo_ros.core.frames import Image8, Reference, RelativePose
+from sphstereo_ros.core.frames import Reference, RelativePose
 from sphstereo_ros.core.joint import JointMatcher
 from sphstereo_ros.core.judgement import Found, Judged
 from sphstereo_ros.core.matching import matcher
+from sphstereo_ros.core.refinement import JointRefinement
 from sphstereo_ros.core.reliability import LEAK, LEAST, LOOKS, Look, look, looks_at
 from sphstereo_ros.core.rotations import exp
 from sphstereo_ros.core.warp import PolarGrid
@@ -85,10 +86,9 @@ class Watched(JointMatcher):
         """Keep what is needed of it."""
         raise NotImplementedError
 
-    def _judged(self, found: Found, grid: PolarGrid, axes: NDArray[np.float64],
-                pairs: Sequence[tuple[Image8, RelativePose]]) -> Judged:
+    def _judged(self, found: Found, refinement: JointRefinement) -> Judged:
         seen = look(found.view, found.refined, found.other, found.matched, found.parallax)
-        self.watch(found, seen, grid, axes, [p.baseline for _, p in pairs])
+        self.watch(found, seen, refinement.grid, refinement.axes, refinement.baselines)
         nothing = np.zeros_like(found.refined.rho)
         return Judged(found.refined.rho, found.other, nothing, nothing.astype(np.int8))
 

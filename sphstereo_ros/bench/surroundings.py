@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from sphstereo_ros.core.alternatives import Alternatives, alternatives
-from sphstereo_ros.core.frames import Image8, Reference, RelativePose
+from sphstereo_ros.core.frames import Reference
 from sphstereo_ros.core.judgement import Found, Judged
 from sphstereo_ros.core.refinement import JointRefinement
 from sphstereo_ros.core.reliability import LEAST, Look, network, percentiles
-from sphstereo_ros.core.surroundings import ADDED, BLOCK, CHANNELS, inputs, interior
+from sphstereo_ros.core.surroundings import ADDED, BLOCK, CHANNELS, GREY, inputs, interior
 from sphstereo_ros.core.warp import PolarGrid
 from sphstereo_ros.scenes.binocular import TopCamera, render_binocular, save_binocular
 from sphstereo_ros.scenes.sequence import (
@@ -83,11 +83,9 @@ class _Kept(Watched):
     patch: Patch | None = None
     _others: Alternatives
 
-    def _judged(self, found: Found, grid: PolarGrid, axes: NDArray[np.float64],
-                pairs: Sequence[tuple[Image8, RelativePose]]) -> Judged:
-        self._others = alternatives(found.refined.rho,
-                                    JointRefinement(found.view, grid, axes, pairs))
-        return super()._judged(found, grid, axes, pairs)
+    def _judged(self, found: Found, refinement: JointRefinement) -> Judged:
+        self._others = alternatives(found.refined.rho, refinement)
+        return super()._judged(found, refinement)
 
     def watch(self, found: Found, seen: Look, grid: PolarGrid, axes: NDArray[np.float64],
               baselines: Sequence[float]) -> None:
@@ -197,13 +195,13 @@ def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, ...]:
     x[:, 10:14] = (x[:, 10:14] * gain + offset).clamp(-2, 2)
     x[:, 23] *= gain
     x[:, 14] = torch.log(0.5 + gain * (torch.exp(x[:, 14] + 1) - 0.5).clamp(min=0)) - 1
-    for at in (25, 29, 33, 38):
+    for at in GREY:
         x[:, at:at + 4] = torch.log(2 + gain * (torch.exp(x[:, at:at + 4] + 2) - 2)) - 2
     if rng.random() < 0.15:
         x[:, 10:14] *= -1
     if rng.random() < 0.5:
         x, *maps = (torch.flip(m, [2]) for m in (x, *maps))
-        for at in (0, 5, 10, 25, 29, 33, 38):
+        for at in (0, 5, 10, *GREY):
             x[:, at:at + 4] = x[:, at:at + 4][:, [2, 3, 0, 1]]
     return x, functional.pixel_shuffle(x[:, 5:9], 2), *maps, patch.ratio
 

@@ -13,31 +13,36 @@ import numpy as np
 from .refinement import JointRefinement
 from .warp import Map
 
-_ROUND, _SPECK = 15, 3  # px: windows of what is round about, and of what is no surface
+_ROUND, _WIDE, _SPECK = 15, 31, 3  # px: windows of what is round about, and of what is no surface
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Maps of a polar grid, float32.
+
+    rho : 1/m; least, most : difference in grey, of the references, if it is there (of
+        `JointRefinement.agreement`)
+    """
+
+    rho: Map
+    least: Map
+    most: Map
 
 
 @dataclass(frozen=True)
 class Alternatives:
-    """Maps of a polar grid, float32.
+    """What was measured, nearest and farthest round about, and farthest more widely."""
 
-    least, most : difference in grey, of the references, of what was measured (of
-        `JointRefinement.agreement`)
-    near, far : 1/m, nearest and farthest round about; near_least, far_least : as `least`
-    """
-
-    least: Map
-    most: Map
-    near: Map
-    near_least: Map
-    far: Map
-    far_least: Map
+    measured: Alternative
+    near: Alternative
+    far: Alternative
+    farther: Alternative
 
 
 def alternatives(rho: Map, refinement: JointRefinement) -> Alternatives:
     """Of what was measured, 1/m."""
-    speck, window = (np.ones((n, n), np.uint8) for n in (_SPECK, _ROUND))
-    near = np.asarray(cv2.dilate(cv2.erode(rho, speck), window), np.float32)
-    far = np.asarray(cv2.erode(cv2.dilate(rho, speck), window), np.float32)
-    least, most = refinement.agreement(rho)
-    return Alternatives(least, most, near, refinement.agreement(near)[0], far,
-                        refinement.agreement(far)[0])
+    speck, window, wide = (np.ones((n, n), np.uint8) for n in (_SPECK, _ROUND, _WIDE))
+    near, far = cv2.erode(rho, speck), cv2.dilate(rho, speck)
+    maps = (rho, cv2.dilate(near, window), cv2.erode(far, window), cv2.erode(far, wide))
+    return Alternatives(*(Alternative(m, *refinement.agreement(m))
+                          for m in (np.asarray(m, np.float32) for m in maps)))

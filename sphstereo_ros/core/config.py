@@ -237,7 +237,7 @@ class RangeConfig:
     minimum: float = _p('range.min', 0.3, 'nearer is −Inf', unit='m', low=0.0, high=1000.0)
     maximum: float = _p('range.max', 120.0, 'confidently farther is +Inf', unit='m', low=0.1,
                         high=10000.0)
-    max_relative_sigma: float = _p('range.max_relative_sigma', 0.45, 'sigma over range above '
+    max_relative_sigma: float = _p('range.max_relative_sigma', 0.5, 'sigma over range above '
                                    'which the range is unknown', low=0.001, high=10.0)
 
 
@@ -268,9 +268,9 @@ class ObstaclesConfig:
     vehicle_width: float = _p('obstacles.vehicle_width', 0.6, 'of the way that must be free, for '
                               'the time to contact', unit='m', low=0.0, high=100.0)
     hidden_width: float = _p('obstacles.hidden_width', 1.0, 'a sector is unknown where something '
-                             'so wide could stand unseen, much nearer than what is measured; 0 = '
-                             'it is told as measured, all the same', unit='m', low=0.0,
-                             high=100.0)
+                             'so wide, or a post, could stand unseen, much nearer than what is '
+                             'measured; 0 = it is told as measured, all the same', unit='m',
+                             low=0.0, high=100.0)
     trust_sky: bool = _p('obstacles.trust_sky', False, 'more than 11° above the horizon, a sector '
                          'may be free where nothing is measured: plain sky has no range, but '
                          'neither has a branch before it that was missed')

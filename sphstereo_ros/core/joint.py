@@ -25,6 +25,7 @@ from .matching import UNKNOWN, Matcher, Parallax, stereo_grid
 from .moving import off_meridian
 from .photometric import in_one_light
 from .refinement import REACH, JointRefinement, Refined
+from .rims import own_surface
 from .sphere import polar_axes
 from .sweep import sweep
 from .warp import Map, PolarGrid, polar_map, resample, with_border
@@ -192,26 +193,25 @@ class JointMatcher:
         before, now = self._alike(view, pairs[0], grid, axes)
         parallax = self._parallax(now, before)
         matched = _nearness(parallax, grid, pairs[0][1].baseline)
-        refined = self._refined(view, grid, axes, pairs, filled(matched))
+        refinement = JointRefinement(view, grid, axes, pairs)
+        refined = self._refined(refinement, filled(matched))
         moving = off_meridian(parallax, refined.misfit, grid, axes, pairs[0][1], height)
         if self._sweeps:
             coarse, _ = sweep(view, grid, axes, self._swept(pairs))
             other = cv2.resize(coarse, grid.shape[::-1], interpolation=cv2.INTER_LINEAR)
-            refined = self._sharpened(view, grid, axes, pairs, refined)
+            refined = self._sharpened(refinement, pairs, refined)
         else:
             other = matched
         found = Found(view, now, before, refined, other, matched, parallax)
-        judged = self._judged(found, grid, axes, pairs)
+        judged = self._judged(found, refinement)
         measured = self._on_sphere(refined, judged, grid, axes, pairs, height)
         return replace(measured, moving=moving)
 
-    def _judged(self, found: Found, grid: PolarGrid, axes: Floats,
-                pairs: Sequence[tuple[Image8, RelativePose]]) -> Judged:
+    def _judged(self, found: Found, refinement: JointRefinement) -> Judged:
+        grid, baselines = refinement.grid, refinement.baselines
         if self._sweeps:
-            others = alternatives(found.refined.rho,
-                                  JointRefinement(found.view, grid, axes, pairs))
-            return by_looks(found, others, grid, [p.baseline for _, p in pairs])
-        return by_agreement(found, found.other, grid, pairs[0][1].baseline, swept=False)
+            return by_looks(found, alternatives(found.refined.rho, refinement), grid, baselines)
+        return by_agreement(found, found.other, grid, baselines[0], swept=False)
 
     def _swept(self, pairs: Sequence[tuple[Image8, RelativePose]],
                ) -> list[tuple[Image8, RelativePose]]:
@@ -227,11 +227,9 @@ class JointMatcher:
     def _parallax(self, current: Image8, reference: Image8) -> Parallax:
         return self._first(current, reference)
 
-    def _refined(self, view: Image8, grid: PolarGrid, axes: Floats,
-                 pairs: Sequence[tuple[Image8, RelativePose]], start: Map) -> Refined:
-        refinement = JointRefinement(view, grid, axes, pairs)
-        if self._sweeps and len(pairs) == 1:
-            wide, *level = (_scaled(most, least, grid.height) for most, least in zip(
+    def _refined(self, refinement: JointRefinement, start: Map) -> Refined:
+        if self._sweeps and len(refinement.baselines) == 1:
+            wide, *level = (_scaled(most, least, refinement.grid.height) for most, least in zip(
                 (_ALONE, *_ALONE_LEVEL), (_LAST, *_LAST_LEVEL), strict=True))
             return refinement.adapted(refinement.refined(start, wide).rho, wide,
                                       (level[0], level[1]))
@@ -240,18 +238,21 @@ class JointMatcher:
             found = refinement.refined(found.rho, window)
         return found
 
-    def _sharpened(self, view: Image8, grid: PolarGrid, axes: Floats,
+    def _sharpened(self, refinement: JointRefinement,
                    pairs: Sequence[tuple[Image8, RelativePose]], known: Refined) -> Refined:
-        """Swept near what is known, and refined within half a level: a window alone would carry
-        ranges across rims. One reference alone has too little parallax for that.
+        """Swept near what is known, refined within half a level (a window alone would carry
+        ranges across rims), and each pixel put to its own surface; information and misfit stay
+        those of the window. One reference alone has too little parallax for that.
         """
         if len(pairs) == 1:
             return known
-        swept = guided_sweep(view, grid, axes, pairs, known.rho)
-        rho, step = (np.asarray(cv2.resize(m, grid.shape[::-1], interpolation=cv2.INTER_LINEAR))
+        size = refinement.grid.shape[::-1]
+        swept = guided_sweep(refinement.view, refinement.grid, refinement.axes, pairs, known.rho)
+        rho, step = (np.asarray(cv2.resize(m, size, interpolation=cv2.INTER_LINEAR))
                      for m in (swept.rho, np.float32(0.5) * swept.step))
-        found = JointRefinement(view, grid, axes, pairs).adapted(rho, _LAST, _LAST_LEVEL)
-        return replace(found, rho=np.clip(found.rho, rho - step, rho + step))
+        found = refinement.adapted(rho, _LAST, _LAST_LEVEL)
+        return replace(found, rho=own_surface(np.clip(found.rho, rho - step, rho + step),
+                                              refinement))
 
     def _on_sphere(self, refined: Refined, judged: Judged, grid: PolarGrid, axes: Floats,
                    pairs: Sequence[tuple[Image8, RelativePose]], height: int) -> Measurement:

@@ -19,7 +19,7 @@ from .judgement import Evidence, Found, Judged, by_agreement
 from .matching import Matcher, Parallax, stereo_grid
 from .refinement import JointRefinement, Refined
 from .sphere import polar_axes
-from .warp import Map, PolarGrid
+from .warp import Map
 
 # px, of the pair alone and of several references: one tells less of a pixel.
 _WINDOW, _WIDE, _NARROW = 15, 25, 9
@@ -111,18 +111,16 @@ class PairMatcher(JointMatcher):
                          new.other, new.frames, limits, alone, self._sweeps, rho, sigma)
         return InverseRange(rho, sigma, self.signed)
 
-    def _refined(self, view: Image8, grid: PolarGrid, axes: Floats,
-                 pairs: Sequence[tuple[Image8, RelativePose]], start: Map) -> Refined:
-        refinement = JointRefinement(view, grid, axes, pairs)
-        if len(pairs) > 1:
+    def _refined(self, refinement: JointRefinement, start: Map) -> Refined:
+        if len(refinement.baselines) > 1:
             found = refinement.refined(start, _NARROW)
             return refinement.levelled(found.rho, _NARROW) if self._sweeps else found
         found = refinement.levelled(start, _WINDOW)
         return refinement.levelled(found.rho, _WINDOW, _WIDE) if self._sweeps else found
 
-    def _sharpened(self, view: Image8, grid: PolarGrid, axes: Floats,
+    def _sharpened(self, refinement: JointRefinement,
                    pairs: Sequence[tuple[Image8, RelativePose]], known: Refined) -> Refined:
-        del view, grid, axes, pairs
+        del refinement, pairs
         return known
 
     def _swept(self, pairs: Sequence[tuple[Image8, RelativePose]],
@@ -133,12 +131,10 @@ class PairMatcher(JointMatcher):
         self._found = super()._parallax(current, reference)
         return self._found
 
-    def _judged(self, found: Found, grid: PolarGrid, axes: Floats,
-                pairs: Sequence[tuple[Image8, RelativePose]]) -> Judged:
+    def _judged(self, found: Found, refinement: JointRefinement) -> Judged:
         """What the sweep sees nearer counts only where the pictures bear it out."""
         rho, other = found.refined.rho, found.other
         if self._sweeps:
-            fit = JointRefinement(found.view, grid, axes, pairs[:1]).misfit(other)
-            fits = fit < _FITS * found.refined.misfit + _GREY
+            fits = refinement.misfit(other) < _FITS * found.refined.misfit + _GREY
             other = np.where(fits | (other < _NEARER * rho), other, np.float32(0))
-        return by_agreement(found, other, grid, pairs[0][1].baseline, self._sweeps)
+        return by_agreement(found, other, refinement.grid, refinement.baselines[0], self._sweeps)

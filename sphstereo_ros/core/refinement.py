@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 
 _NOISE = 2.0  # grey levels, of the difference of two views beside what range explains
 _MOST = 400.0  # squared grey levels: a worse difference tells no more than that it does not fit
-_MOST_GREY = 60.0  # grey levels, of a single pixel
+_MOST_GREY, _MOST_APART = 60.0, 30.0  # grey levels, of a single pixel; where windows are compared
 _FIT_WINDOW, _MEAN_WINDOW = 7, 21
 _HOLD = 1e-3  # information of the start: where nothing is told, it stays
 _SAME = 0.3  # px by which a wide window may differ from a narrow one, to be taken in its place
@@ -94,6 +94,18 @@ def _agree(first: int, last: int, current: Image8, mean: Map, view: Image8, view
             e = min(e, np.float32(_MOST_GREY))
             least[i, j] = min(least[i, j], e)
             most[i, j] = max(most[i, j], e)
+
+
+@fast_kernel
+def _apart(first: int, last: int, current: Image8, mean: Map, view: Image8, view_mean: Map,
+           gain: np.float32, most: np.float32,
+           out: Map) -> None:  # pragma: no cover - compiled
+    """Difference in grey of one reference, up to `most`."""
+    for i in range(first, last):
+        for j in range(out.shape[1]):
+            e = abs(np.float32(current[i, j]) - mean[i, j]
+                    - gain * (np.float32(view[i, j]) - view_mean[i, j]))
+            out[i, j] = min(e, most)
 
 
 @fast_kernel
@@ -177,12 +189,18 @@ class JointRefinement:
     grid, axes : the grid and its axes (3, 3) in the current optical frame
     references : equirectangular images (H, 2H) and poses, nearest first
 
+    Attributes
+    ----------
+    view, grid, axes : as given
+    baselines : of the references, m
+
     """
 
     def __init__(self, current: Image8, grid: PolarGrid, axes: Floats,
                  references: Sequence[tuple[Image8, RelativePose]]) -> None:
-        self._current, self._mean = current, _mean(current)
-        self._grid, self._axes, self._references = grid, axes, references
+        self.view, self._mean = current, _mean(current)
+        self.grid, self.axes, self._references = grid, axes, references
+        self.baselines = [pose.baseline for _, pose in references]
         theta, azimuth = grid.theta(), grid.azimuth()
         self._angles = [np.ascontiguousarray(a, np.float32) for a in (
             np.cos(theta), np.sin(theta), np.cos(azimuth), np.sin(azimuth))]
@@ -209,14 +227,14 @@ class JointRefinement:
         weighted, weight, best = self._collected(rho)
         far, information = _averaged(rho, weighted, weight, window)
         near, _ = self._on_level(rho, weighted, weight, *level)
-        slanted = far > np.float32(1 / (NEAR_BY * self._references[0][1].baseline))
+        slanted = far > np.float32(1 / (NEAR_BY * self.baselines[0]))
         return Refined(np.where(slanted, near, far), information, best)
 
     def _on_level(self, rho: Map, weighted: Map, weight: Map, window: int,
                   wide: int) -> tuple[Map, Map]:
         narrow, information = _levelled(rho, weighted, weight, window)
         if wide:
-            alike = np.float32(_SAME * self._grid.pixel / self._references[0][1].baseline)
+            alike = np.float32(_SAME * self.grid.pixel / self.baselines[0])
             broad, _ = _levelled(rho, weighted, weight, wide)
             narrow = np.where(np.abs(broad - narrow) < alike, broad, narrow)
         return narrow, information
@@ -239,27 +257,43 @@ class JointRefinement:
         """
         return self._difference(*self._references[0], rho)[2]
 
+    def difference(self, rho: Map, window: int) -> Map:
+        """Mean difference in grey, in windows of `window` px, if it lies at `rho`, of the two
+        references that differ least: grey levels less what is round about, of the grid's shape.
+        """
+        least = second = np.full_like(rho, np.inf)
+        for image, pose in self._references:
+            view = reference_in_relief(image, pose, self.grid, self.axes, rho)
+            view_mean, apart = _mean(view), np.empty_like(rho)
+            gain = _gain(self.view, self._mean, view, view_mean)
+            rows_in_parallel(_apart, len(rho), self.view, self._mean, view, view_mean, gain,
+                             np.float32(_MOST_APART), apart)
+            apart = np.asarray(cv2.blur(apart, (window, window)))
+            second = np.minimum(second, np.maximum(least, apart))
+            least = np.minimum(least, apart)
+        return least if len(self._references) == 1 else np.float32(0.5) * (least + second)
+
     def agreement(self, rho: Map) -> tuple[Map, Map]:
         """Least and most difference in grey, of the references, of each pixel by itself if it lies
         at `rho`: grey levels less what is round about, float32 of the grid's shape.
         """
         least, most = np.full_like(rho, _MOST_GREY), np.zeros_like(rho)
         for n, (image, pose) in enumerate(self._references):
-            view = reference_in_relief(image, pose, self._grid, self._axes, rho)
+            view = reference_in_relief(image, pose, self.grid, self.axes, rho)
             view_mean = _mean(view)
-            gain = _gain(self._current, self._mean, view, view_mean)
-            rows_in_parallel(_agree, len(rho), self._current, self._mean, view, view_mean, gain,
+            gain = _gain(self.view, self._mean, view, view_mean)
+            rows_in_parallel(_agree, len(rho), self.view, self._mean, view, view_mean, gain,
                              rho, np.float32(pose.baseline if n else 0), least, most)
         return least, most
 
     def _difference(self, image: Image8, pose: RelativePose, rho: Map) -> tuple[Map, Map, Map]:
-        view = reference_in_relief(image, pose, self._grid, self._axes, rho)
+        view = reference_in_relief(image, pose, self.grid, self.axes, rho)
         view_mean = _mean(view)
         slope, error, squared = (np.empty_like(rho) for _ in range(3))
-        position = np.asarray(self._axes.T @ pose.position, np.float32)
-        gain = _gain(self._current, self._mean, view, view_mean)
-        rows_in_parallel(_differences, len(rho), self._current, self._mean, view, view_mean, gain,
-                         rho, *self._angles, position, np.float32(1 / self._grid.pixel), slope,
+        position = np.asarray(self.axes.T @ pose.position, np.float32)
+        gain = _gain(self.view, self._mean, view, view_mean)
+        rows_in_parallel(_differences, len(rho), self.view, self._mean, view, view_mean, gain,
+                         rho, *self._angles, position, np.float32(1 / self.grid.pixel), slope,
                          error, squared)
         fit = cv2.boxFilter(squared, -1, (_FIT_WINDOW, _FIT_WINDOW))
         return slope, error, fit

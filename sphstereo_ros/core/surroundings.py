@@ -23,13 +23,15 @@ from .matching import UNKNOWN
 from .reliability import TAIL, Look, _geometry, logarithms
 from .warp import Map, PolarGrid
 
-CHANNELS = 43
+CHANNELS = 60
 _TOLD = 7  # outputs for each pixel
 BLOCK = 32  # px at half size: what the network halves five times
 _ROUND = 64  # px at half size that it sees beyond the seam
 ADDED = np.float32(0.1)  # px of the shortest baseline, before a parallax's logarithm is taken
 _LEAST = np.float32(1e-3)  # px that are told at least
-_LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24, *range(25, 43))  # of the inputs
+# Inputs that tell how alternatives differ in grey, of four pixels each, and their inverse range.
+GREY, _SHARE = (25, 29, 33, 38, 43, 47, 51, 55), (37, 42, 59)
+_LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24, *range(25, 60))  # of the inputs
 
 
 @fast_kernel
@@ -64,10 +66,8 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
         information += full[4, r, c] * unit * unit
         longest += pixels * scale[2]
         sines += s
-        x[25 + n, p] = np.float32(2) + others[0][r, c]
-        x[29 + n, p] = np.float32(2) + others[1][r, c]
-        x[33 + n, p] = np.float32(2) + others[3][r, c]
-        x[38 + n, p] = np.float32(2) + others[5][r, c]
+        for k in range(8):
+            x[GREY[k] + n, p] = np.float32(2) + others[k][r, c]
     x[4, p], x[9, p] = quarter * nearer, quarter * sign
     x[14, p] = np.float32(0.5) + half[12, h, w]
     x[15, p] = np.float32(0.1) + quarter * swept
@@ -77,9 +77,9 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
     x[21, p] = np.float32(0.1) + quarter * longest
     x[22, p], x[23, p] = quarter * sines, high - low
     x[24, p] = np.float32(0.05) + half[13, h, w]
-    for k in range(2):
-        share = others[2 + 2 * k][2 * h, 2 * w] / units[2 * h, 2 * w]
-        x[37 + 5 * k, p] = np.float32(1.1) + min(max(share, -one), np.float32(20))
+    for k in range(3):
+        share = others[8 + k][2 * h, 2 * w] / units[2 * h, 2 * w]
+        x[_SHARE[k], p] = np.float32(1.1) + min(max(share, -one), np.float32(20))
 
 
 @fast_kernel
@@ -107,8 +107,9 @@ def _input_rows(first: int, last: int, view: Image8, full: NDArray[np.float32],
                 x[20, p] *= np.float32(0.2)
                 x[21, p] *= np.float32(0.5)
                 x[24, p] += np.float32(1)
-                for k in range(25, CHANNELS):
-                    x[k, p] -= np.float32(0 if k == 37 or k == 42 else 2)
+                for k in range(8):
+                    for n in range(4):
+                        x[GREY[k] + n, p] -= np.float32(2)
             for k in range(CHANNELS):
                 for p in range(BLOCK):
                     out[0, k, i, start + p] = x[k, p]
@@ -131,8 +132,9 @@ def inputs(view: Image8, seen: Look, others: Alternatives, told: NDArray[np.floa
     rows, columns = seen.half.shape[1:]
     size = [-(-n // BLOCK) * BLOCK for n in (rows + 2 * _ROUND, columns)]
     out = np.empty((1, CHANNELS, *size), np.float32)
-    maps = (others.least, others.most, others.near, others.near_least, others.far,
-            others.far_least)
+    measured, near, far, farther = others.measured, others.near, others.far, others.farther
+    maps = (measured.least, measured.most, near.least, far.least, near.most, far.most,
+            farther.least, farther.most, near.rho, far.rho, farther.rho)
     rows_in_parallel(_input_rows, size[0], view, seen.full, seen.half, maps, told, unit,
                      *_geometry(grid, baselines), grid.wrap // 2, out)
     return out

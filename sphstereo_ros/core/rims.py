@@ -1,0 +1,151 @@
+"""Which surface a pixel belongs to, near rims.
+
+Windows see across rims, so what is farther has the range of what is nearer beside it, some pixels
+wide: a far street between leaves would be as near as they are. Each pixel chooses between its own
+range and those round about (`alternatives`), by how the references look if it lies there and by
+what its neighbours choose: as in semi-global matching (Hirschmüller 2008), with candidates in
+place of levels, as in fusion moves (Lempitsky et al. 2010). What is near by keeps its range; what
+is not far is put farther only where that looks better, whatever its neighbours choose.
+"""
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from .frames import Image8
+from .jit import fast_kernel, kernel, rows_in_parallel
+from .refinement import JointRefinement
+from .reliability import NEAR_BY
+from .warp import Map
+
+_SPECK, _NEARER, _FARTHER = 3, 15, (9, 15, 31)  # px: no surface; windows of what is round about
+_WINDOW = 5  # px, in which views are compared
+_KEEP = 0.5  # grey levels, by which another range must look better
+_FAR = 80.0  # baselines of the nearest reference: farther away, neighbours may decide alone
+# Neighbours of different ranges cost so many grey levels a unit, up to so many units (a share of
+# the range, or a pixel of the longest baseline); less where grey changes, to half at _EDGE.
+_CHANGE, _MOST, _SHARE, _EDGE = 8.0, 3.0, 0.1, 10.0
+_NEVER = 1e6
+_COUNT = 2 + len(_FARTHER)
+
+
+@fast_kernel
+def _keep_rows(first: int, last: int, rho: Map, nearest: np.float32,
+               cost: Map) -> None:  # pragma: no cover - compiled
+    """What another range than the pixel's own, the first, costs besides."""
+    keep, never = np.float32(_KEEP), np.float32(_NEVER)
+    for i in range(first, last):
+        for j in range(rho.shape[1]):
+            own = rho[i, j, 0] * nearest
+            near_by, far = own * np.float32(NEAR_BY) > 1, own * np.float32(_FAR) < 1
+            for k in range(1, _COUNT):
+                worse = cost[i, j, k] + keep >= cost[i, j, 0]
+                farther = rho[i, j, k] < rho[i, j, 0]
+                held = near_by or (farther and worse and not far)
+                cost[i, j, k] += never if held else keep
+
+
+@fast_kernel
+def _step(cost: Map, rho: Map, rho_before: Map, weight: np.float32, unit: np.float32, before: Map,
+          out: Map) -> None:  # pragma: no cover - compiled
+    """Least costs of a path that ends in each candidate of a pixel, from those of the one before.
+    """
+    least = before[0]
+    for n in range(1, _COUNT):
+        least = min(least, before[n])
+    per_unit, most = weight / unit, weight * np.float32(_MOST)
+    for k in range(_COUNT):
+        best = before[0] + min(abs(rho[k] - rho_before[0]) * per_unit, most)
+        for n in range(1, _COUNT):
+            best = min(best, before[n] + min(abs(rho[k] - rho_before[n]) * per_unit, most))
+        out[k] = cost[k] + best - least
+
+
+@fast_kernel
+def _weight(view: Image8, i: int, j: int, ip: int,
+            jp: int) -> np.float32:  # pragma: no cover - compiled
+    change = abs(np.float32(view[i, j]) - np.float32(view[ip, jp]))
+    return np.float32(_CHANGE * _EDGE) / (np.float32(_EDGE) + change)
+
+
+@kernel
+def _along_rows(first: int, last: int, cost: Map, rho: Map, unit: Map, view: Image8,
+                total: Map) -> None:  # pragma: no cover - compiled
+    columns = cost.shape[1]
+    path = np.empty((2, _COUNT), np.float32)
+    for i in range(first, last):
+        for way in range(2):
+            path[:] = 0
+            for n in range(columns):
+                j = n if way == 0 else columns - 1 - n
+                jp = max(j - 1, 0) if way == 0 else min(j + 1, columns - 1)
+                _step(cost[i, j], rho[i, j], rho[i, jp], _weight(view, i, j, i, jp), unit[i, j],
+                      path[n % 2], path[1 - n % 2])
+                for k in range(_COUNT):
+                    total[i, j, k] += path[1 - n % 2, k]
+
+
+@kernel
+def _across_rows(first: int, last: int, cost: Map, rho: Map, unit: Map, view: Image8,
+                 total: Map) -> None:  # pragma: no cover - compiled
+    """Down and up columns first … last."""
+    rows = len(cost)
+    path = np.empty((2, last - first, _COUNT), np.float32)
+    for way in range(2):
+        path[:] = 0
+        for n in range(rows):
+            i = n if way == 0 else rows - 1 - n
+            ip = max(i - 1, 0) if way == 0 else min(i + 1, rows - 1)
+            for j in range(first, last):
+                c = j - first
+                _step(cost[i, j], rho[i, j], rho[ip, j], _weight(view, i, j, ip, j), unit[i, j],
+                      path[n % 2, c], path[1 - n % 2, c])
+                for k in range(_COUNT):
+                    total[i, j, k] += path[1 - n % 2, c, k]
+
+
+@kernel
+def _choice_rows(first: int, last: int, total: Map, rho: Map,
+                 out: Map) -> None:  # pragma: no cover - compiled
+    for i in range(first, last):
+        for j in range(out.shape[1]):
+            best = 0
+            for k in range(1, total.shape[2]):
+                if total[i, j, k] < total[i, j, best]:
+                    best = k
+            out[i, j] = rho[i, j, best]
+
+
+def _candidates(rho: Map) -> list[Map]:
+    """The pixel's own, and what lies round about, without specks."""
+    def square(size: int) -> Image8:
+        return np.ones((size, size), np.uint8)
+    near, far = cv2.erode(rho, square(_SPECK)), cv2.dilate(rho, square(_SPECK))
+    return [rho, np.asarray(cv2.dilate(near, square(_NEARER))),
+            *(np.asarray(cv2.erode(far, square(n))) for n in _FARTHER)]
+
+
+def own_surface(rho: Map, refinement: JointRefinement) -> Map:
+    """Inverse range (1/m, of the grid's shape), where each pixel has that of the surface it shows.
+
+    Parameters
+    ----------
+    rho : what was measured, 1/m
+    refinement : whose references are compared
+
+    """
+    candidates = _candidates(rho)
+    found, cost = (np.empty((*rho.shape, _COUNT), np.float32) for _ in range(2))
+    for k, candidate in enumerate(candidates):
+        found[..., k], cost[..., k] = candidate, refinement.difference(candidate, _WINDOW)
+    baselines = np.array([min(refinement.baselines), max(refinement.baselines)], np.float32)
+    sine = np.abs(np.sin(refinement.grid.theta())).astype(np.float32)
+    rows_in_parallel(_keep_rows, len(cost), found, baselines[0], cost)
+    unit = np.maximum(np.float32(_SHARE) * rho, np.float32(refinement.grid.pixel) / (
+        baselines[1] * np.maximum(sine, np.float32(0.02))))
+    total = np.zeros_like(cost)
+    rows_in_parallel(_along_rows, len(cost), cost, found, unit, refinement.view, total)
+    rows_in_parallel(_across_rows, cost.shape[1], cost, found, unit, refinement.view, total)
+    out = np.empty_like(rho)
+    rows_in_parallel(_choice_rows, len(out), total, found, out)
+    return out
