@@ -1,10 +1,11 @@
 """What else may be where something was measured."""
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from test_refinement import BALL, seen
 
-from sphstereo_ros.core.alternatives import alternatives
+from sphstereo_ros.core.alternatives import alternatives, round_about
 from sphstereo_ros.core.refinement import JointRefinement
 
 SIZE, WIDE = 15 // 2, 31 // 2  # px that are round about, and more widely
@@ -46,11 +47,28 @@ def test_nearest_and_farthest_round_about_without_specks():
     found = alternatives(rho, refinement_of(view))
     assert (found.near.rho[50:70] == np.float32(0.2)).all()
     near, far, farther = 101 - SIZE, 99 + SIZE, 99 + WIDE  # a row at a rim is a speck as well
-    assert (found.near.rho[near:] == np.float32(0.5)).all()
-    assert (found.near.rho[:near] == np.float32(0.2)).all()
+    part = np.s_[50:-50]  # away from the seam, where both meet again
+    assert (found.near.rho[part][near - 50:] == np.float32(0.5)).all()
+    assert (found.near.rho[part][:near - 50] == np.float32(0.2)).all()
     for rim, other in ((far, found.far), (farther, found.farther)):
-        assert (other.rho[:rim] == np.float32(0.2)).all()
-        assert (other.rho[rim:] == np.float32(0.5)).all()
+        assert (other.rho[part][:rim - 50] == np.float32(0.2)).all()
+        assert (other.rho[part][rim - 50:] == np.float32(0.5)).all()
+
+
+def test_round_about_goes_on_beyond_the_seam():
+    view = seen()
+    grid, count = view.grid, 2 * view.grid.height
+    rng = np.random.default_rng(0)
+    inner = cv2.GaussianBlur(rng.uniform(0.1, 1, (count, grid.shape[1])).astype(np.float32),
+                             (0, 0), 2)
+    turn = count // 3
+
+    def found(values: np.ndarray) -> list[np.ndarray]:
+        rho = np.take(values, np.arange(-grid.wrap, count + grid.wrap), axis=0, mode='wrap')
+        near, others = round_about(rho, grid, 15, (9, 31))
+        return [m[grid.wrap:-grid.wrap] for m in (near, *others)]
+    for straight, turned in zip(found(inner), found(np.roll(inner, turn, 0)), strict=True):
+        np.testing.assert_array_equal(np.roll(straight, turn, 0), turned)
 
 
 def test_each_is_compared_with_the_references():

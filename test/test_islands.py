@@ -72,3 +72,12 @@ def test_an_island_amid_what_is_unknown_stays():
     r[:40] = 3
     r[100:112, 200:216] = 20
     assert not far_islands(r).any()
+
+
+@pytest.mark.parametrize('reaches_down', [False, True])
+@pytest.mark.parametrize('by', [520, 536, 700])
+def test_the_seam_may_be_anywhere(by, reaches_down):
+    """In the patch, too."""
+    r = large(reaches_down)
+    np.testing.assert_array_equal(far_islands(np.roll(r, by, axis=1)),
+                                  np.roll(far_islands(r), by, axis=1))

@@ -109,12 +109,16 @@ def test_the_difference_is_that_of_the_two_references_that_fit_best(fattened):
     view, _, wide = fattened
     one, two = (JointRefinement(view.image, view.grid, view.axes, [pair]).difference(wide, 5)
                 for pair in view.pairs)
-    blank = (np.full_like(view.pairs[0][0], 128), view.pairs[1][1])
-    all_three = JointRefinement(view.image, view.grid, view.axes, [*view.pairs, blank])
-    three = JointRefinement(view.image, view.grid, view.axes, [blank]).difference(wide, 5)
+    noise = np.random.default_rng(0).integers(0, 255, view.pairs[0][0].shape, np.uint8)
+    other = (noise, view.pairs[1][1])
+    all_three = JointRefinement(view.image, view.grid, view.axes, [*view.pairs, other])
+    three = JointRefinement(view.image, view.grid, view.axes, [other]).difference(wide, 5)
     a, b, _ = np.sort(np.stack([one, two, three]), 0)
     np.testing.assert_allclose(all_three.difference(wide, 5), (a + b) / 2, atol=1e-3)
     assert np.median(one) < np.median(three)
+    nothing = (np.full_like(noise, 128), view.pairs[1][1])
+    with_blank = JointRefinement(view.image, view.grid, view.axes, [*view.pairs, nothing])
+    np.testing.assert_allclose(with_blank.difference(wide, 5), (one + two) / 2, atol=1e-3)
 
 
 def test_the_matcher_puts_pixels_to_their_own_surface(fattened, monkeypatch):

@@ -5,13 +5,15 @@ look if a pixel lies there instead, each pixel by itself, tells which.
 """
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from .refinement import JointRefinement
-from .warp import Map
+from .warp import Map, PolarGrid
 
 _ROUND, _WIDE, _SPECK = 15, 31, 3  # px: windows of what is round about, and of what is no surface
 
@@ -41,8 +43,19 @@ class Alternatives:
 
 def alternatives(rho: Map, refinement: JointRefinement) -> Alternatives:
     """Of what was measured, 1/m."""
-    speck, window, wide = (np.ones((n, n), np.uint8) for n in (_SPECK, _ROUND, _WIDE))
-    near, far = cv2.erode(rho, speck), cv2.dilate(rho, speck)
-    maps = (rho, cv2.dilate(near, window), cv2.erode(far, window), cv2.erode(far, wide))
+    near, (far, farther) = round_about(rho, refinement.grid, _ROUND, (_ROUND, _WIDE))
     return Alternatives(*(Alternative(m, *refinement.agreement(m))
-                          for m in (np.asarray(m, np.float32) for m in maps)))
+                          for m in (rho, near, far, farther)))
+
+
+def round_about(rho: Map, grid: PolarGrid, nearer: int,
+                farther: Sequence[int]) -> tuple[Map, list[Map]]:
+    """The nearest in a window of so many px, and the farthest in each of some, without specks."""
+    def square(size: int) -> NDArray[np.uint8]:
+        return np.ones((size, size), np.uint8)
+    more = max(nearer, *farther) // 2 + _SPECK
+    whole, inside = grid.continued(rho, more), slice(more, -more)
+    near, far = cv2.erode(whole, square(_SPECK)), cv2.dilate(whole, square(_SPECK))
+    found = [cv2.dilate(near, square(nearer)), *(cv2.erode(far, square(n)) for n in farther)]
+    first, *others = (np.ascontiguousarray(m[inside], np.float32) for m in found)
+    return first, others

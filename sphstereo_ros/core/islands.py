@@ -25,24 +25,31 @@ def far_islands(distance: NDArray[np.float32]) -> NDArray[np.bool_]:
     distance : (H, 2H) metres; NaN unknown, ±Inf as published. Returns (H, 2H).
     """
     small = distance[::_STEP, ::_STEP]
+    size, more = small.size, small.shape[1] // 4
+    # On round the sphere: a patch that the seam cuts is not two small ones.
+    small = np.concatenate([small[:, -more:], small, small[:, :more]], axis=1)
     known = ~np.isnan(small)
     found = np.zeros(small.shape, bool)
     for border in _NEAR:
         near = known & (small < border)
         if near.any():
-            found |= _islands(known & (small > _BEYOND * border), near, known)
-    return np.asarray(cv2.resize(found.view(np.uint8), distance.shape[::-1],
+            found |= _islands(known & (small > _BEYOND * border), near, known, size)
+    inside = np.ascontiguousarray(found[:, more:-more])
+    return np.asarray(cv2.resize(inside.view(np.uint8), distance.shape[::-1],
                                  interpolation=cv2.INTER_NEAREST) > 0)
 
 
 def _islands(far: NDArray[np.bool_], near: NDArray[np.bool_],
-             known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Connected patches of `far`, not too large, that what is `near` surrounds where `known`."""
+             known: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    """Connected patches of `far`, not too large, that what is `near` surrounds where `known`.
+
+    pixels : of the whole sphere
+    """
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(far.view(np.uint8),
                                                                     connectivity=8)
     size = statistics[:, cv2.CC_STAT_AREA]
-    small = size < _SMALL[0] * far.size
-    candidate = small | ((size < _LARGE[0] * far.size) & (size >= _FRAMED))
+    small = size < _SMALL[0] * pixels
+    candidate = small | ((size < _LARGE[0] * pixels) & (size >= _FRAMED))
     candidate[0] = False
     inside = candidate[labels]
     if not inside.any():

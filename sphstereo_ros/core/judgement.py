@@ -107,9 +107,7 @@ def by_looks(found: Found, others: Alternatives, grid: PolarGrid,
 def _share_round(sure: NDArray[np.bool_], grid: PolarGrid) -> Map:
     """Share of what is sure round about each pixel, on round the sphere."""
     reach = round(_ROUND * grid.height / 2)
-    inner = sure[grid.wrap:-grid.wrap].astype(np.float32)
-    beyond = [(n + np.arange(-grid.wrap - reach, 0)) % len(inner) for n in (0, grid.wrap + reach)]
-    whole = np.concatenate([inner[beyond[0]], inner, inner[beyond[1]]])
+    whole = grid.continued(sure.astype(np.float32), reach)
     size = (2 * reach + 1, 2 * reach + 1)
     return np.asarray(cv2.blur(whole, size)[reach:len(whole) - reach], np.float32)
 

@@ -28,6 +28,7 @@ _MOST_GREY, _MOST_APART = 60.0, 30.0  # grey levels, of a single pixel; where wi
 _FIT_WINDOW, _MEAN_WINDOW = 7, 21
 _HOLD = 1e-3  # information of the start: where nothing is told, it stays
 _SAME = 0.3  # px by which a wide window may differ from a narrow one, to be taken in its place
+_MOST_GAIN = 3.0  # a reference of so much less contrast shows nothing that could be compared
 _UNFIT = 4.0  # a reference is left out where it fits that much worse than the best
 NEAR_BY = 30.0  # baselines of the nearest reference: there, slopes matter more than noise
 REACH = 0.7  # baseline over range beyond which a reference looks too different
@@ -139,7 +140,7 @@ def _gain(current: Image8, mean: Map, view: Image8, view_mean: Map) -> np.float3
     a = (current[::4, ::4] - mean[::4, ::4]).ravel()
     b = (view[::4, ::4] - view_mean[::4, ::4]).ravel()
     ratio = np.sqrt(float(a @ a) / max(float(b @ b), 1e-9))
-    return np.float32(min(max(ratio, 0.3), 3.0))
+    return np.float32(min(max(ratio, 1 / _MOST_GAIN), _MOST_GAIN))
 
 
 def _averaged(rho: Map, weighted: Map, weight: Map, window: int) -> tuple[Map, Map]:
@@ -266,12 +267,14 @@ class JointRefinement:
             view = reference_in_relief(image, pose, self.grid, self.axes, rho)
             view_mean, apart = _mean(view), np.empty_like(rho)
             gain = _gain(self.view, self._mean, view, view_mean)
+            if gain >= _MOST_GAIN and np.isfinite(least).all():
+                continue
             rows_in_parallel(_apart, len(rho), self.view, self._mean, view, view_mean, gain,
                              np.float32(_MOST_APART), apart)
             apart = np.asarray(cv2.blur(apart, (window, window)))
             second = np.minimum(second, np.maximum(least, apart))
             least = np.minimum(least, apart)
-        return least if len(self._references) == 1 else np.float32(0.5) * (least + second)
+        return np.asarray(np.where(np.isfinite(second), np.float32(0.5) * (least + second), least))
 
     def agreement(self, rho: Map) -> tuple[Map, Map]:
         """Least and most difference in grey, of the references, of each pixel by itself if it lies
@@ -282,6 +285,8 @@ class JointRefinement:
             view = reference_in_relief(image, pose, self.grid, self.axes, rho)
             view_mean = _mean(view)
             gain = _gain(self.view, self._mean, view, view_mean)
+            if n and gain >= _MOST_GAIN:
+                continue
             rows_in_parallel(_agree, len(rho), self.view, self._mean, view, view_mean, gain,
                              rho, np.float32(pose.baseline if n else 0), least, most)
         return least, most

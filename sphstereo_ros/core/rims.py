@@ -9,16 +9,16 @@ is not far is put farther only where that looks better, whatever its neighbours 
 """
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
+from .alternatives import round_about
 from .frames import Image8
 from .jit import fast_kernel, kernel, rows_in_parallel
 from .refinement import JointRefinement
 from .reliability import NEAR_BY
 from .warp import Map
 
-_SPECK, _NEARER, _FARTHER = 3, 15, (9, 15, 31)  # px: no surface; windows of what is round about
+_NEARER, _FARTHER = 15, (9, 15, 31)  # px: windows of what is round about
 _WINDOW = 5  # px, in which views are compared
 _KEEP = 0.5  # grey levels, by which another range must look better
 _FAR = 80.0  # baselines of the nearest reference: farther away, neighbours may decide alone
@@ -116,15 +116,6 @@ def _choice_rows(first: int, last: int, total: Map, rho: Map,
             out[i, j] = rho[i, j, best]
 
 
-def _candidates(rho: Map) -> list[Map]:
-    """The pixel's own, and what lies round about, without specks."""
-    def square(size: int) -> Image8:
-        return np.ones((size, size), np.uint8)
-    near, far = cv2.erode(rho, square(_SPECK)), cv2.dilate(rho, square(_SPECK))
-    return [rho, np.asarray(cv2.dilate(near, square(_NEARER))),
-            *(np.asarray(cv2.erode(far, square(n))) for n in _FARTHER)]
-
-
 def own_surface(rho: Map, refinement: JointRefinement) -> Map:
     """Inverse range (1/m, of the grid's shape), where each pixel has that of the surface it shows.
 
@@ -134,9 +125,9 @@ def own_surface(rho: Map, refinement: JointRefinement) -> Map:
     refinement : whose references are compared
 
     """
-    candidates = _candidates(rho)
+    nearer, farther = round_about(rho, refinement.grid, _NEARER, _FARTHER)
     found, cost = (np.empty((*rho.shape, _COUNT), np.float32) for _ in range(2))
-    for k, candidate in enumerate(candidates):
+    for k, candidate in enumerate((rho, nearer, *farther)):
         found[..., k], cost[..., k] = candidate, refinement.difference(candidate, _WINDOW)
     baselines = np.array([min(refinement.baselines), max(refinement.baselines)], np.float32)
     sine = np.abs(np.sin(refinement.grid.theta())).astype(np.float32)

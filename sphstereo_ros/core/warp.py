@@ -55,6 +55,12 @@ class PolarGrid:
         """Azimuth of every row, rad."""
         return np.asarray((np.arange(self.shape[0]) - self.wrap + 0.5) * self.pixel, np.float64)
 
+    def continued(self, values: NDArray[Any], rows: int) -> NDArray[Any]:
+        """`values` of this grid with so many more rows at either end, on round the sphere."""
+        count = 2 * self.height
+        return np.asarray(values[(np.arange(-rows, self.shape[0] + rows) - self.wrap) % count
+                                 + self.wrap])
+
 
 def with_border(image: NDArray[Any]) -> NDArray[Any]:
     """A full sphere (H, W[, C]) with BORDER pixels around it that continue it over seam and poles.
