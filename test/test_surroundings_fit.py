@@ -54,7 +54,7 @@ def test_a_fit_completes():
     x[5:9], x[10:14, :, 32:] = 0, 1  # logarithm of what was measured; grey
     true = np.where(np.arange(128) < 64, 0.5, 1.5)[None] * np.ones((128, 1))
     maps = [m.astype(np.float16) for m in (0 * true, true, 1 + 0 * true)]
-    parts = fit([Patch(x.astype(np.float16), *maps, 1.0)], 120, rng)
+    parts = fit([Patch(x.astype(np.float16), *maps, 1.0)], 200, rng)
     with torch.no_grad():
         out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
     larger, likely = out[12:16].mean(0), np.exp(out[16:20].mean(0))
