@@ -8,7 +8,7 @@ do (occluded there, or moved) are left out.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -263,12 +263,8 @@ class JointRefinement:
         references that differ least: grey levels less what is round about, of the grid's shape.
         """
         least = second = np.full_like(rho, np.inf)
-        for image, pose in self._references:
-            view = reference_in_relief(image, pose, self.grid, self.axes, rho)
-            view_mean, apart = _mean(view), np.empty_like(rho)
-            gain = _gain(self.view, self._mean, view, view_mean)
-            if gain >= _MOST_GAIN and np.isfinite(least).all():
-                continue
+        for view, view_mean, gain, _ in self._comparable(rho):
+            apart = np.empty_like(rho)
             rows_in_parallel(_apart, len(rho), self.view, self._mean, view, view_mean, gain,
                              np.float32(_MOST_APART), apart)
             apart = np.asarray(cv2.blur(apart, (window, window)))
@@ -281,15 +277,21 @@ class JointRefinement:
         at `rho`: grey levels less what is round about, float32 of the grid's shape.
         """
         least, most = np.full_like(rho, _MOST_GREY), np.zeros_like(rho)
+        for view, view_mean, gain, baseline in self._comparable(rho):
+            rows_in_parallel(_agree, len(rho), self.view, self._mean, view, view_mean, gain, rho,
+                             baseline, least, most)
+        return least, most
+
+    def _comparable(self, rho: Map) -> Iterator[tuple[Image8, Map, np.float32, np.float32]]:
+        """The nearest reference and all others that have contrast, each as seen if it lies at
+        `rho`, its mean, gain, and baseline (0: the nearest, which counts everywhere).
+        """
         for n, (image, pose) in enumerate(self._references):
             view = reference_in_relief(image, pose, self.grid, self.axes, rho)
             view_mean = _mean(view)
             gain = _gain(self.view, self._mean, view, view_mean)
-            if n and gain >= _MOST_GAIN:
-                continue
-            rows_in_parallel(_agree, len(rho), self.view, self._mean, view, view_mean, gain,
-                             rho, np.float32(pose.baseline if n else 0), least, most)
-        return least, most
+            if n == 0 or gain < _MOST_GAIN:
+                yield view, view_mean, gain, np.float32(pose.baseline if n else 0)
 
     def _difference(self, image: Image8, pose: RelativePose, rho: Map) -> tuple[Map, Map, Map]:
         view = reference_in_relief(image, pose, self.grid, self.axes, rho)
