@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from sphstereo_ros.core.config import resolve
-from sphstereo_ros.core.frames import Reference, RelativePose
-from sphstereo_ros.core.joint import JointMatcher
+from sphstereo_ros.core.frames import Frame, Reference, RelativePose
+from sphstereo_ros.core.joint import JointMatcher, Measurement
 from sphstereo_ros.core.judgement import Found, Judged
 from sphstereo_ros.core.matching import matcher
 from sphstereo_ros.core.refinement import JointRefinement
@@ -80,6 +80,12 @@ class Watched(JointMatcher):
     def __init__(self, truth: TruthFrame) -> None:
         super().__init__('joint', matcher(resolve({}).stereo))
         self._truth = truth
+        self.unit = 1.0  # m: of the nearest baseline, of which ranges and baselines count here
+
+    def measure(self, current: Frame, references: Sequence[Reference]) -> Measurement:
+        """As `JointMatcher.measure`; poses are metric."""
+        self.unit = references[0].pose.baseline
+        return super().measure(current, references)
 
     def watch(self, found: Found, seen: Look, grid: PolarGrid, axes: NDArray[np.float64],
               baselines: Sequence[float]) -> None:
@@ -94,8 +100,8 @@ class Watched(JointMatcher):
 
     def true(self, grid: PolarGrid, axes: NDArray[np.float64], rows: NDArray[np.int64],
              columns: NDArray[np.int64]) -> Floats:
-        """Inverse range, 1/m; NaN where it is unknown or moves."""
-        return true_on_grid(self._truth, grid, axes, rows, columns)
+        """Inverse range, per `unit`; NaN where it is unknown or moves."""
+        return self.unit * true_on_grid(self._truth, grid, axes, rows, columns)
 
 
 class _Sampled(Watched):
@@ -113,7 +119,7 @@ class _Sampled(Watched):
         looks, unit = looks_at(seen, grid, baselines, rows, columns)
         rho = found.refined.rho[rows, columns]
         error, weight = (true - rho) / unit, np.ones_like(unit)
-        weight[(true > 0.01) & (true < 0.1)] = _RARE
+        weight[(true > 0.01 * self.unit) & (true < 0.1 * self.unit)] = _RARE
         known = np.isfinite(true)
         self.samples = Samples(looks[known], error[known], weight[known])
 

@@ -98,8 +98,9 @@ class _Kept(Watched):
         error = (true - rho) / unit
         sine = np.maximum(np.sin(grid.theta()), 0.02)[None]
         weight = np.isfinite(error) * sine
-        weight *= np.where((true > 0.01) & (true < 0.1), _RARE, 1)
-        weight *= np.where((true > 0.1) & (rho < true / 1.5), _TOO_FAR, 1)
+        rare, near = (true > 0.01 * self.unit) & (true < 0.1 * self.unit), true > 0.1 * self.unit
+        weight *= np.where(rare, _RARE, 1)
+        weight *= np.where(near & (rho < true / 1.5), _TOO_FAR, 1)
         pixels = np.nan_to_num(true) * sine * min(baselines) / grid.pixel
         self.patch = Patch(x[0].astype(np.float16),
                            np.clip(np.nan_to_num(error), -99, 99).astype(np.float16),

@@ -64,13 +64,27 @@ class Measurement:
 
 def in_steps(pose: RelativePose) -> RelativePose:
     """The pose with positions in metres, or in steps between frames where metres are unknown."""
-    if pose.is_metric:
-        return pose
+    return pose if pose.is_metric else _stretched(pose, 1 / UNSCALED)
+
+
+def _stretched(pose: RelativePose, times: float) -> RelativePose:
+    """The pose with a position that is so many times as far."""
     covariance = None
     if pose.covariance is not None:
-        stretch = np.diag([1.0, 1.0, 1.0, *[1 / UNSCALED] * 3])
+        stretch = np.diag([1.0, 1.0, 1.0, *[times] * 3])
         covariance = stretch @ pose.covariance @ stretch
-    return RelativePose(pose.rotation, pose.position / UNSCALED, covariance)
+    return RelativePose(pose.rotation, times * pose.position, covariance)
+
+
+def _by_nearest(references: Sequence[Reference],
+                ) -> tuple[list[tuple[Image8, RelativePose]], float]:
+    """Images and poses with positions in units of the nearest baseline, and that baseline, m (or
+    steps): what is found does not hang on the scale, then.
+    """
+    poses = [in_steps(r.pose) for r in references]
+    unit = poses[0].baseline
+    return [(r.frame.image, _stretched(pose, 1 / unit))
+            for r, pose in zip(references, poses, strict=True)], unit
 
 
 @fast_kernel
@@ -118,14 +132,14 @@ def filled(rho: Map) -> Map:
 @kernel
 def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map, sin_lon: Map,
                   axes: Map, at_pole: Map, rho: Map, error: Map, frames: Evidence, other: Map,
-                  baselines: Map, ways: Map, pose: Map, told: Map, out: Map,
-                  sigma_out: Map, other_out: Map, frames_out: Evidence,
+                  baselines: Map, ways: Map, pose: Map, told: Map, per_unit: np.float32,
+                  out: Map, sigma_out: Map, other_out: Map, frames_out: Evidence,
                   told_out: Map) -> None:  # pragma: no cover - compiled
     """Sample the polar grid; σ of every pixel, with the pose's share.
 
     at_pole : column of the pole, row of the azimuth 0, rad of a pixel, px that no match beats;
     ways : (references, 3) directions of motion; pose : (references, 3) standard deviations of
-    rotation, direction, baseline
+    rotation, direction, baseline; per_unit : 1/m of what inverse range and baselines are given in
     """
     at = np.empty((4, cos_lon.size), np.float32)
     half, nothing = np.float32(0.5), np.float32(NOTHING)
@@ -154,12 +168,12 @@ def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Ma
             by_angle = np.sqrt(match * match + pose[k, 0] * pose[k, 0]) / (baselines[k] * sine)
             by_pose = value * (cosine / sine * pose[k, 1] + pose[k, 2])
             likely = error[rn, cn]
-            out[i, j] = value
-            sigma_out[i, j] = min(np.sqrt(likely * likely + by_angle * by_angle
-                                          + by_pose * by_pose), nothing)
-            other_out[i, j] = other[rn, cn]
+            out[i, j] = value * per_unit
+            sigma_out[i, j] = min(per_unit * np.sqrt(likely * likely + by_angle * by_angle
+                                                     + by_pose * by_pose), nothing)
+            other_out[i, j] = other[rn, cn] * per_unit
             frames_out[i, j] = frames[rn, cn]
-            told_out[i, j] = told[rn, cn]
+            told_out[i, j] = told[rn, cn] * per_unit
 
 
 def _scaled(most: int, least: int, height: int) -> int:
@@ -183,8 +197,11 @@ class JointMatcher:
         self._windows = _WINDOWS[method]
 
     def measure(self, current: Frame, references: Sequence[Reference]) -> Measurement:
-        """Inverse range of every pixel; `references` nearest first, all metric or none."""
-        pairs = [(r.frame.image, in_steps(r.pose)) for r in references]
+        """Inverse range of every pixel; `references` nearest first, all metric or none.
+
+        What is found counts in nearest baselines until it is put back on the sphere.
+        """
+        pairs, unit = _by_nearest(references)
         height = current.image.shape[0]
         grid = stereo_grid(height)
         axes = polar_axes(pairs[0][1].direction)
@@ -204,7 +221,7 @@ class JointMatcher:
             other = matched
         found = Found(view, now, before, refined, other, matched, parallax)
         judged = self._judged(found, refinement)
-        measured = self._on_sphere(refined, judged, grid, axes, pairs, height)
+        measured = self._on_sphere(refined, judged, grid, axes, pairs, unit, height)
         return replace(measured, moving=moving)
 
     def _judged(self, found: Found, refinement: JointRefinement) -> Judged:
@@ -255,7 +272,8 @@ class JointMatcher:
                                               refinement))
 
     def _on_sphere(self, refined: Refined, judged: Judged, grid: PolarGrid, axes: Floats,
-                   pairs: Sequence[tuple[Image8, RelativePose]], height: int) -> Measurement:
+                   pairs: Sequence[tuple[Image8, RelativePose]], unit: float,
+                   height: int) -> Measurement:
         rho, sigma, second, told = (np.empty((height, 2 * height), np.float32) for _ in range(4))
         noise = np.float32(DEPENDENT) / np.sqrt(np.maximum(refined.information, 1e-9))
         frames = np.empty(rho.shape, np.int8)
@@ -268,5 +286,5 @@ class JointMatcher:
         rows_in_parallel(_measure_rows, height, *_grid_angles(height),
                          np.ascontiguousarray(axes, np.float32), at_pole, judged.rho,
                          judged.error, judged.frames, judged.other, baselines, ways, poses, noise,
-                         rho, sigma, second, frames, told)
+                         np.float32(1 / unit), rho, sigma, second, frames, told)
         return Measurement(rho, sigma, second, frames, told)
