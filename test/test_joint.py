@@ -47,12 +47,14 @@ def measured(method: str, view: PairedWindow) -> Measurement:
 
 
 def test_what_is_judged_is_what_is_measured(monkeypatch):
-    """Range, too, where something else is likelier than what was measured."""
+    """Range, too, where something else is likelier than what was measured; judged in nearest
+    baselines.
+    """
     _, view = seen()
     before = measured('joint', view)
     decide = joint.by_looks
     monkeypatch.setattr(joint, 'by_looks', lambda *given: replace(
-        decide(*given), rho=np.full_like(given[0].view, 0.25, np.float32)))
+        decide(*given), rho=np.full_like(given[0].view, 0.25 * 0.3, np.float32)))
     found = measured('joint', view)
     assert np.ptp(before.rho) > 0.1
     np.testing.assert_allclose(found.rho, 0.25, rtol=1e-6)
@@ -268,6 +270,22 @@ def test_the_images_are_left_as_they_are():
     for copy, frame in zip(copies, (view.current, *(r.frame for r in view.references)),
                            strict=True):
         np.testing.assert_array_equal(copy, frame.image)
+
+
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('scale', [0.07, 3.0, 40.0])
+def test_scale_decides_nothing(method, scale):
+    """Poses so many times as far apart: ranges so many times as far, pixel by pixel."""
+    _, view = seen()
+    larger = PairedWindow(view.current, tuple(
+        replace(r, pose=RelativePose(r.pose.rotation, scale * r.pose.position,
+                                     r.pose.covariance * np.diag([1, 1, 1, *[scale**2] * 3])))
+        for r in view.references))
+    one, other = measured(method, view), measured(method, larger)
+    np.testing.assert_array_equal(one.frames, other.frames)
+    for a, b in ((one.rho, other.rho), (one.sigma, other.sigma), (one.told, other.told),
+                 (one.other, other.other)):
+        np.testing.assert_allclose(scale * b, a, rtol=1e-4, atol=1e-5)
 
 
 # --- parts
