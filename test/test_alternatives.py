@@ -1,8 +1,12 @@
 """What else may be where something was measured."""
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import cv2
 import numpy as np
+from analytic_world import World
+from polar_views import polar_view
 from test_refinement import BALL, seen
 
 from sphstereo_ros.core.alternatives import alternatives, round_about
@@ -15,11 +19,15 @@ def refinement_of(view):
     return JointRefinement(view.image, view.grid, view.axes, view.pairs)
 
 
+def compared_of(view):
+    return refinement_of(view).compared(view.rho())
+
+
 def test_references_differ_least_where_things_are():
     view = seen()
     theta = view.theta()
     inside = (theta > 20) & (theta < 160)
-    true, wrong = (refinement_of(view).agreement((view.rho() * s).astype(np.float32))
+    true, wrong = (compared_of(view).agreement((view.rho() * s).astype(np.float32))
                    for s in (1, 1.4))
     for right, off in zip(true, wrong, strict=True):
         assert np.median(right[inside]) < 3
@@ -30,13 +38,54 @@ def test_references_differ_least_where_things_are():
 def test_of_the_references_the_one_that_fits_best_and_worst():
     view = seen()
     rho = (1.2 * view.rho()).astype(np.float32)
-    each = [JointRefinement(view.image, view.grid, view.axes, [pair]).agreement(rho)[0]
-            for pair in view.pairs]
-    least, most = refinement_of(view).agreement(rho)
+    each = [compared_of(replace(view, pairs=[pair])).agreement(rho)[0] for pair in view.pairs]
+    least, most = compared_of(view).agreement(rho)
     np.testing.assert_allclose(least, np.minimum(*each), atol=1e-4)
     np.testing.assert_allclose(most, np.maximum(*each), atol=1e-4)
     assert np.mean(each[0] > each[1]) > 0.1
     assert np.mean(each[0] < each[1]) > 0.1
+
+
+def test_references_in_another_light_show_the_same():
+    """Of more contrast, and brighter to one side."""
+    view = seen()
+    image, pose = view.pairs[0]
+    shade = np.linspace(0, 40, image.shape[1])
+    other = np.clip(0.6 * image + shade, 0, 255).astype(np.uint8)
+    lit = replace(view, pairs=[(other, pose), *view.pairs[1:]])
+    theta = view.theta()
+    inside = (theta > 20) & (theta < 160)
+    plain, found = (compared_of(v).difference(view.rho(), 5)[inside] for v in (view, lit))
+    assert np.median(found) < np.median(plain) + 1
+
+
+@dataclass(frozen=True)
+class BrightPosts(World):
+    """A dim room with posts that are bright."""
+
+    def brightness(self, points: np.ndarray) -> np.ndarray:
+        dim = 60 + 0.2 * super().brightness(points)
+        for x, z, radius in self.posts:
+            near = np.hypot(points[..., 0] - x, points[..., 2] - z) < 1.01 * radius
+            dim = np.where(near, 220.0, dim)
+        return dim
+
+
+def test_what_stands_beside_changes_no_light():
+    """At the true range of what is seen beside bright posts, nothing differs, though the posts
+    themselves are supposed to lie as far.
+    """
+    angles = np.radians(np.arange(30, 360, 40))
+    world = BrightPosts(cell=2.0, low=(-20.0,) * 3, high=(20.0,) * 3, posts=tuple(
+        (float(6 * np.sin(a)), float(6 * np.cos(a)), 0.2) for a in angles))
+    view = polar_view(world, ((0.0, 0.0, -0.3), (0.0, 0.0, 0.3)))
+    posts = (view.rho() > 1 / 8).astype(np.uint8)
+    behind = cv2.erode(view.rho(), np.ones((25, 25), np.uint8))
+    wide, narrow = (cv2.dilate(posts, np.ones((n, n), np.uint8)) > 0 for n in (9, 5))
+    beside = wide & ~narrow
+    assert beside.mean() > 0.02
+    least, _ = compared_of(view).agreement(behind)
+    assert np.median(least[beside]) < 3
 
 
 def test_nearest_and_farthest_round_about_without_specks():
@@ -75,9 +124,9 @@ def test_each_is_compared_with_the_references():
     view, refinement = seen(), refinement_of(seen())
     rho = np.full(view.grid.shape, 1 / BALL.radius, np.float32)
     rho[:, view.grid.shape[1] // 2:] *= 1.5
-    found = alternatives(rho, refinement)
+    found, compared = alternatives(rho, refinement), refinement.compared(rho)
     np.testing.assert_array_equal(found.measured.rho, rho)
     for other in (found.measured, found.near, found.far, found.farther):
-        least, most = refinement.agreement(other.rho)
+        least, most = compared.agreement(other.rho)
         np.testing.assert_array_equal(other.least, least)
         np.testing.assert_array_equal(other.most, most)

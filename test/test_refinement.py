@@ -212,6 +212,16 @@ def slanted(window: int, wide: int = 0, averaged: bool = False, world: World = R
     return np.abs(found.rho - view.rho())[inside] / pixel
 
 
+def test_looking_changes_no_range_and_tells_what_a_step_from_there_would():
+    view = seen()
+    refinement = JointRefinement(view.image, view.grid, view.axes, view.pairs)
+    rho = off_by(view, 0.1)
+    looked, step = refinement.looked_at(rho, WINDOW), refinement.refined(rho, WINDOW)
+    np.testing.assert_array_equal(looked.rho, rho)
+    np.testing.assert_array_equal(looked.information, step.information)
+    np.testing.assert_array_equal(looked.misfit, step.misfit)
+
+
 def test_the_slope_of_a_surface_is_no_noise():
     assert np.median(slanted(15)) < 0.6 * np.median(slanted(15, averaged=True))
 

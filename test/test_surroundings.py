@@ -14,6 +14,7 @@ from sphstereo_ros.bench.accuracy import as_frame
 from sphstereo_ros.bench.obstacles import frames_of_bag
 from sphstereo_ros.bench.surroundings import patches_of
 from sphstereo_ros.core import judgement
+from sphstereo_ros.core.alternatives import Alternative, Alternatives
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import Reference
 from sphstereo_ros.core.joint import JointMatcher
@@ -21,7 +22,7 @@ from sphstereo_ros.core.judgement import together
 from sphstereo_ros.core.matching import UNKNOWN, matcher
 from sphstereo_ros.core.refinement import Refined
 from sphstereo_ros.core.reliability import look, network, percentiles
-from sphstereo_ros.core.surroundings import CHANNELS, completed, inputs, judged
+from sphstereo_ros.core.surroundings import CHANNELS, inputs, judged, likeliest
 from sphstereo_ros.scenes.binocular import render_binocular, save_binocular
 from sphstereo_ros.scenes.sequence import true_pose
 
@@ -90,7 +91,7 @@ def test_sizes_halve_evenly():
     out, seen, told, _ = seen_at(found(np.random.default_rng(3)))
     assert out.shape[2] % BLOCK == out.shape[3] % BLOCK == 0
     assert out.shape[2] >= seen.half.shape[1] + 2 * ROUND
-    assert judged(out, GRID.shape).shape == (7, *told.shape[1:])
+    assert judged(out, GRID.shape).shape == (12, *told.shape[1:])
 
 
 @settings(max_examples=8, deadline=None)
@@ -128,9 +129,17 @@ def test_a_view_that_is_turned_is_judged_as_before():
     np.testing.assert_allclose(np.roll(a, turn, 1)[:, 64:-64], b[:, 64:-64], atol=0.3)
 
 
+def told_of(choice: np.ndarray, larger: np.ndarray | float = 0.0) -> np.ndarray:
+    """What the network tells, if of five ranges it chooses that one."""
+    told = np.zeros((12, *GRID.shape), np.float32)
+    told[3] = larger
+    np.put_along_axis(told, 7 + choice[None], np.float32(1), 0)
+    return told
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 1000), st.floats(0.01, 100))
-def test_what_is_completed_is_as_much_larger_as_told(seed, scale):
+def test_the_networks_own_range_is_as_much_larger_as_told(seed, scale):
     """The network tells by how much the logarithm of the shortest baseline's parallax, and a tenth
     of a pixel, is larger than where the unit was measured.
     """
@@ -138,9 +147,23 @@ def test_what_is_completed_is_as_much_larger_as_told(seed, scale):
     unit, true = (rng.uniform(0.01, 2, GRID.shape).astype(np.float32) / scale for _ in range(2))
     pixel = GRID.pixel / np.maximum(np.abs(np.sin(GRID.theta())), 0.02)
     measured, wanted = (np.log(0.1 + m * min(baselines) / pixel) for m in (unit, true))
-    rho, its_unit = completed((wanted - measured).astype(np.float32), unit, GRID, baselines)
+    told = told_of(np.full(GRID.shape, 4), wanted - measured)
+    others = others_of(Refined(unit, unit, unit))
+    rho, its_unit = likeliest(told, unit, others, GRID, baselines)
     np.testing.assert_allclose(rho, true, rtol=1e-3, atol=1e-4 / scale)
     np.testing.assert_allclose(its_unit, np.maximum(rho, pixel / max(baselines)), rtol=1e-5)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 1000))
+def test_the_likeliest_is_what_was_chosen(seed):
+    rng = np.random.default_rng(seed)
+    ranges = rng.uniform(0.01, 2, (4, *GRID.shape)).astype(np.float32)
+    others = Alternatives(*(Alternative(m, m, m) for m in ranges))
+    choice = rng.integers(0, 4, GRID.shape)
+    rho, unit = likeliest(told_of(choice), ranges[0], others, GRID, BASELINES)
+    np.testing.assert_array_equal(rho, np.take_along_axis(ranges, choice[None], 0)[0])
+    assert (unit >= rho).all()
 
 
 @settings(max_examples=20, deadline=None)
@@ -180,7 +203,7 @@ def test_sky_behind_leaves_is_refused(monkeypatch, references, least):
     assert known > least
     # A network that believes everything leaves the decision to what a pixel tells by itself.
     monkeypatch.setattr(judgement, 'judged', lambda x, shape: np.broadcast_to(
-        np.float32([-9, -9, -9, 0, 9, 9, 9])[:, None, None], (7, *shape)))
+        np.float32([-9, -9, -9, 0, 9, 9, 9, 9, 0, 0, 0, 0])[:, None, None], (12, *shape)))
     alone, _ = believed()
     assert ghosts < 0.25 * alone
 

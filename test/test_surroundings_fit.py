@@ -47,8 +47,8 @@ def test_a_fit_tells_small_errors_from_large_ones():
     assert large == pytest.approx(0.2, rel=0.5)
 
 
-def test_a_fit_completes():
-    """Parallax that grey tells, and what was measured does not."""
+def test_a_fit_tells_a_range_of_its_own():
+    """Parallax that grey tells, and what was measured or lies round about does not."""
     rng = np.random.default_rng(0)
     x = rng.normal(0, 0.1, (CHANNELS, 64, 64)).astype(np.float32)
     x[5:9], x[10:14, :, 32:] = 0, 1  # logarithm of what was measured; grey
@@ -58,9 +58,27 @@ def test_a_fit_completes():
     with torch.no_grad():
         out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
     larger, likely = out[12:16].mean(0), np.exp(out[16:20].mean(0))
+    choice = out[28:48].reshape(5, 4, *out.shape[1:]).argmax(0)
+    assert (choice == 4).mean() > 0.9
     assert np.median(np.abs(larger[:, 4:28] - 0.5)) < 0.1
     assert np.median(np.abs(larger[:, 36:60] - 1.5)) < 0.1
     assert np.median(likely) < 0.2
+
+
+def test_a_fit_chooses():
+    """What lies farther round about is right where grey is high, else what was measured."""
+    rng = np.random.default_rng(0)
+    x = rng.normal(0, 0.1, (CHANNELS, 64, 64)).astype(np.float32)
+    x[5:9], x[10:14, :, 32:] = np.log(1.1), 1  # 1 px was measured
+    x[37], x[42], x[59] = np.log(1.1 + 2), np.log(1.1 + 0.4), np.log(1.1 + 0.2)  # shares of it
+    right = np.where(np.arange(128) < 64, 1, 0.4)[None] * np.ones((128, 1))
+    maps = [m.astype(np.float16) for m in (right - 1, np.log(0.1 + right), 1 + 0 * right)]
+    parts = fit([Patch(x.astype(np.float16), *maps, 0.1)], 200, rng)
+    with torch.no_grad():
+        out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
+    choice = out[28:48].reshape(5, 4, *out.shape[1:]).argmax(0)
+    assert np.isin(choice[:, :, 4:28], (0, 4)).mean() > 0.9
+    assert np.isin(choice[:, :, 36:60], (2, 4)).mean() > 0.9
 
 
 def test_nothing_is_fitted_to_what_is_not_known():

@@ -24,7 +24,16 @@ from sphstereo_ros.core.frames import Reference
 from sphstereo_ros.core.judgement import Found, Judged
 from sphstereo_ros.core.refinement import JointRefinement
 from sphstereo_ros.core.reliability import LEAST, Look, network, percentiles
-from sphstereo_ros.core.surroundings import ADDED, BLOCK, CHANNELS, GREY, inputs, interior
+from sphstereo_ros.core.surroundings import (
+    ABOVE,
+    ADDED,
+    BLOCK,
+    CHANNELS,
+    GREY,
+    SHARES,
+    inputs,
+    interior,
+)
 from sphstereo_ros.core.warp import PolarGrid
 from sphstereo_ros.scenes.binocular import TopCamera, render_binocular, save_binocular
 from sphstereo_ros.scenes.sequence import (
@@ -48,16 +57,22 @@ _WINDOWS = {2: ((0, (1,)),), 4: ((3, (2, 1, 0)), (3, (2, 1)), (3, (2,))),
 _TURNED = 4.0  # degrees about each axis at most, of a pair's top camera
 # Weights of what is 10 to 100 m away, and of what is near but was found far.
 _RARE, _TOO_FAR = 2.0, 2.0
-_WIDTHS = (16, 32, 48, 64, 64, 64)  # channels at half size, a quarter, …
+_WIDTHS = (24, 32, 48, 64, 64, 64)  # channels at half size, a quarter, …
 _LAST = 32
 _BEGIN = -2.3  # logarithm of the error that it starts from
 _ROWS, _COLUMNS, _BATCH, _RATE = 192, 256, 3, 1e-3
 _TRUE = 0.02  # share of a sample of which the truth has to be known
 _LARGE, _OFTEN = 600, 0.5  # rows at half size of a patch that is drawn so often at least
 
-_OF_ERROR = len(PERCENTILES)
+# Of what is chosen: the logarithm of its error counts up to _WRONG; so much more where it is
+# farther than the truth by more than such a logarithm; and how much all that counts.
+_WRONG, _FARTHER, _WORSE, _CHOICE = 0.5, 0.35, 0.3, 4.0
+
+_OF_ERROR, _CHOSEN = len(PERCENTILES), 2 + len(SHARES)
+_OWN, _LIKELIEST, _CHOICES = _OF_ERROR, _OF_ERROR + 1, 2 * _OF_ERROR + 1  # outputs
 DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
-                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * 4 + [_BEGIN] * (4 * _OF_ERROR))
+                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * 4 + [_BEGIN] * (4 * _OF_ERROR)
+                + [2.0] * 4 + [0.0] * (4 * (_CHOSEN - 1)))
 
 
 @dataclass(frozen=True)
@@ -170,27 +185,51 @@ def _render_pairs(folder: Path) -> None:
         target.with_suffix('.part').rename(target)
 
 
-def loss(out: Any, measured: Any, error: Any, true: Any, weight: Any, ratio: float) -> Any:
-    """Of the percentiles of each pixel, of what was measured and of what is completed, and of that
-    itself.
+def candidates(x: Any, error: Any, true: Any, own: Any) -> tuple[Any, Any]:
+    """Parallaxes (N, 5, …), px of the shortest baseline, of what may be chosen: what was measured,
+    nearest, farthest, and farthest more widely round about, and the network's own; and the true.
+
+    own : logarithm of the network's own, and ADDED
+    """
+    import torch
+    from torch.nn import functional
+    unit = torch.exp(functional.pixel_shuffle(x[:, 5:9], 2)) - float(ADDED)
+    pixels = torch.exp(true) - float(ADDED)
+
+    def larger(half: Any) -> Any:
+        return functional.interpolate(half, scale_factor=2, mode='nearest')
+    shares = [torch.exp(x[:, k:k + 1]) - float(ABOVE) for k in SHARES]
+    round_about = [larger(share) * larger(unit[:, :, ::2, ::2]) for share in shares]
+    return torch.cat([pixels - error * unit, *round_about, torch.exp(own) - float(ADDED)],
+                     1), pixels
+
+
+def loss(out: Any, x: Any, error: Any, true: Any, weight: Any, ratio: float) -> Any:
+    """Of the percentiles of each pixel, of what was measured and of what is likeliest, of the
+    network's own range, and of the choice.
     """
     import torch
     from torch.nn import functional
     told = functional.pixel_shuffle(out, 2)
-    completed = told[:, _OF_ERROR:_OF_ERROR + 1] + measured
-    pixels = torch.exp(completed.detach()) - float(ADDED)
-    off = (torch.exp(true) - float(ADDED) - pixels) / pixels.clamp(min=ratio)
+    own = told[:, _OWN:_LIKELIEST] + functional.pixel_shuffle(x[:, 5:9], 2)
+    found, pixels = candidates(x, error, true, own.detach())
+    nearer = torch.log(pixels.clamp(min=ratio)) - torch.log(found.clamp(min=ratio))
+    wrong = nearer.abs().clamp(max=_WRONG) + _WORSE * (nearer > _FARTHER)
+    choices = told[:, _CHOICES:]
+    chosen = (torch.softmax(choices, 1) * wrong).sum(1, keepdim=True)
+    likeliest = found.gather(1, choices.argmax(1, keepdim=True))
+    off = (pixels - likeliest) / likeliest.clamp(min=ratio)
 
     def of(percentiles: Any, error: Any) -> Any:
         return percentile_loss(percentiles, error, weight, LEAST, MOST, PERCENTILES)
-    return (of(told[:, :_OF_ERROR], error) + of(told[:, _OF_ERROR + 1:], off)
-            + (weight * (true - completed).abs()).sum() / weight.sum())
+    apart = (true - own).abs() + _CHOICE * chosen
+    return (of(told[:, :_OF_ERROR], error) + of(told[:, _LIKELIEST:_CHOICES], off)
+            + (weight * apart).sum() / weight.sum())
 
 
 def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, ...]:
     """A part of a patch, in another light or mirrored."""
     import torch
-    from torch.nn import functional
     x, maps = _part(patch, rng)
     gain, offset = float(np.exp(rng.normal(0, 0.25))), float(rng.normal(0, 0.3))
     x[:, 10:14] = (x[:, 10:14] * gain + offset).clamp(-2, 2)
@@ -204,7 +243,7 @@ def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, ...]:
         x, *maps = (torch.flip(m, [2]) for m in (x, *maps))
         for at in (0, 5, 10, *GREY):
             x[:, at:at + 4] = x[:, at:at + 4][:, [2, 3, 0, 1]]
-    return x, functional.pixel_shuffle(x[:, 5:9], 2), *maps, patch.ratio
+    return x, x, *maps, patch.ratio
 
 
 def _part(patch: Patch, rng: np.random.Generator) -> tuple[Any, list[Any]]:

@@ -23,7 +23,7 @@ class Alternative:
     """Maps of a polar grid, float32.
 
     rho : 1/m; least, most : difference in grey, of the references, if it is there (of
-        `JointRefinement.agreement`)
+        `Comparison.agreement`)
     """
 
     rho: Map
@@ -44,7 +44,8 @@ class Alternatives:
 def alternatives(rho: Map, refinement: JointRefinement) -> Alternatives:
     """Of what was measured, 1/m."""
     near, (far, farther) = round_about(rho, refinement.grid, _ROUND, (_ROUND, _WIDE))
-    return Alternatives(*(Alternative(m, *refinement.agreement(m))
+    compared = refinement.compared(rho)
+    return Alternatives(*(Alternative(m, *compared.agreement(m))
                           for m in (rho, near, far, farther)))
 
 

@@ -258,8 +258,8 @@ class JointMatcher:
     def _sharpened(self, refinement: JointRefinement,
                    pairs: Sequence[tuple[Image8, RelativePose]], known: Refined) -> Refined:
         """Swept near what is known, refined within half a level (a window alone would carry
-        ranges across rims), and each pixel put to its own surface; information and misfit stay
-        those of the window. One reference alone has too little parallax for that.
+        ranges across rims), and each pixel put to its own surface. One reference alone has too
+        little parallax for that.
         """
         if len(pairs) == 1:
             return known
@@ -268,8 +268,8 @@ class JointMatcher:
         rho, step = (np.asarray(cv2.resize(m, size, interpolation=cv2.INTER_LINEAR))
                      for m in (swept.rho, np.float32(0.5) * swept.step))
         found = refinement.adapted(rho, _LAST, _LAST_LEVEL)
-        return replace(found, rho=own_surface(np.clip(found.rho, rho - step, rho + step),
-                                              refinement))
+        sharp = np.clip(found.rho, rho - step, rho + step)
+        return refinement.looked_at(own_surface(sharp, refinement), _LAST)
 
     def _on_sphere(self, refined: Refined, judged: Judged, grid: PolarGrid, axes: Floats,
                    pairs: Sequence[tuple[Image8, RelativePose]], unit: float,

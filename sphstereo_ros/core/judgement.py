@@ -15,7 +15,7 @@ from .match_judge import likely_error, shows_the_same
 from .matching import Parallax
 from .refinement import Refined
 from .reliability import NEAR_BY, expected_error, look, may_be_near, network, percentiles
-from .surroundings import completed, inputs, judged
+from .surroundings import inputs, judged, likeliest
 from .sweep import reduction
 from .warp import Map, PolarGrid, _arctan2
 
@@ -96,10 +96,10 @@ def by_looks(found: Found, others: Alternatives, grid: PolarGrid,
     frames = sure.astype(np.int8) + (sure & (likely < np.float32(_PLAIN)))
     frames = np.where(near < np.float32(_VEILED), frames, np.int8(-1))
     rho = found.refined.rho.copy()
-    guess = completed(wider[3], unit, grid, baselines)
+    guess = likeliest(wider, unit, others, grid, baselines)
     scale = np.array([grid.pixel, min(baselines), np.exp(-_TAIL)], np.float32)
     theta = grid.theta().astype(np.float32)
-    rows_in_parallel(_complete_rows, len(rho), found.now, found.before, wider[4:], *guess,
+    rows_in_parallel(_complete_rows, len(rho), found.now, found.before, wider[4:7], *guess,
                      _share_round(sure, grid), theta, scale, rho, error, frames)
     return Judged(rho, found.other, error, frames)
 
@@ -119,7 +119,7 @@ def _complete_rows(first: int, last: int, view: Image8, before: Image8,
                    frames: Evidence) -> None:  # pragma: no cover - compiled
     """What was measured (rho, error, frames) becomes what is completed, where that is likelier.
 
-    told, guess, unit : of `judged` and `completed`; amid : share of what is sure round about
+    told, guess, unit : of `judged` and `likeliest`; amid : share of what is sure round about
     scale : rad of a pixel, shortest baseline, share of the 95th percentile that is likely
     """
     for i in range(first, last):

@@ -24,8 +24,9 @@ Floats = NDArray[np.float64]
 
 _NOISE = 2.0  # grey levels, of the difference of two views beside what range explains
 _MOST = 400.0  # squared grey levels: a worse difference tells no more than that it does not fit
-_MOST_GREY, _MOST_APART = 60.0, 30.0  # grey levels, of a single pixel; where windows are compared
+_MOST_GREY, _MOST_APART = 60.0, 15.0  # grey levels, of a single pixel; where windows are compared
 _FIT_WINDOW, _MEAN_WINDOW = 7, 21
+_LIGHT = 1 / 20  # of the grid's height: across it, the light of references may differ
 _HOLD = 1e-3  # information of the start: where nothing is told, it stays
 _SAME = 0.3  # px by which a wide window may differ from a narrow one, to be taken in its place
 _MOST_GAIN = 3.0  # a reference of so much less contrast shows nothing that could be compared
@@ -79,9 +80,16 @@ def _differences(first: int, last: int, current: Image8, mean: Map, view: Image8
 
 
 @fast_kernel
-def _agree(first: int, last: int, current: Image8, mean: Map, view: Image8, view_mean: Map,
-           gain: np.float32, rho: Map, baseline: np.float32, least: Map,
-           most: Map) -> None:  # pragma: no cover - compiled
+def _in_light(first: int, last: int, current: Image8, view: Image8, gain: np.float32,
+              out: Map) -> None:  # pragma: no cover - compiled
+    for i in range(first, last):
+        for j in range(out.shape[1]):
+            out[i, j] = np.float32(current[i, j]) - gain * np.float32(view[i, j])
+
+
+@fast_kernel
+def _agree(first: int, last: int, wanted: Map, view: Image8, gain: np.float32, rho: Map,
+           baseline: np.float32, least: Map, most: Map) -> None:  # pragma: no cover - compiled
     """Take one reference's difference in grey into the least and the most of them.
 
     Where the reference looks too different, nothing is taken; baseline 0 = it always counts.
@@ -90,23 +98,18 @@ def _agree(first: int, last: int, current: Image8, mean: Map, view: Image8, view
         for j in range(rho.shape[1]):
             if abs(rho[i, j]) * baseline >= np.float32(REACH):
                 continue
-            e = abs(np.float32(current[i, j]) - mean[i, j]
-                    - gain * (np.float32(view[i, j]) - view_mean[i, j]))
-            e = min(e, np.float32(_MOST_GREY))
+            e = min(abs(wanted[i, j] - gain * np.float32(view[i, j])), np.float32(_MOST_GREY))
             least[i, j] = min(least[i, j], e)
             most[i, j] = max(most[i, j], e)
 
 
 @fast_kernel
-def _apart(first: int, last: int, current: Image8, mean: Map, view: Image8, view_mean: Map,
-           gain: np.float32, most: np.float32,
+def _apart(first: int, last: int, wanted: Map, view: Image8, gain: np.float32, most: np.float32,
            out: Map) -> None:  # pragma: no cover - compiled
     """Difference in grey of one reference, up to `most`."""
     for i in range(first, last):
         for j in range(out.shape[1]):
-            e = abs(np.float32(current[i, j]) - mean[i, j]
-                    - gain * (np.float32(view[i, j]) - view_mean[i, j]))
-            out[i, j] = min(e, most)
+            out[i, j] = min(abs(wanted[i, j] - gain * np.float32(view[i, j])), most)
 
 
 @fast_kernel
@@ -252,46 +255,35 @@ class JointRefinement:
                              np.float32(pose.baseline), weighted, weight)
         return weighted, weight, best
 
+    def looked_at(self, rho: Map, window: int) -> Refined:
+        """`rho` as it is, and what is told of it in windows of `window` px."""
+        _, weight, best = self._collected(rho)
+        return Refined(rho, np.asarray(cv2.boxFilter(weight, -1, (window, window),
+                                                     normalize=False)), best)
+
     def misfit(self, rho: Map) -> Map:
         """Mean squared grey difference round each pixel, if it lies at `rho`, of the nearest
         reference.
         """
         return self._difference(*self._references[0], rho)[2]
 
-    def difference(self, rho: Map, window: int) -> Map:
-        """Mean difference in grey, in windows of `window` px, if it lies at `rho`, of the two
-        references that differ least: grey levels less what is round about, of the grid's shape.
-        """
-        least = second = np.full_like(rho, np.inf)
-        for view, view_mean, gain, _ in self._comparable(rho):
-            apart = np.empty_like(rho)
-            rows_in_parallel(_apart, len(rho), self.view, self._mean, view, view_mean, gain,
-                             np.float32(_MOST_APART), apart)
-            apart = np.asarray(cv2.blur(apart, (window, window)))
-            second = np.minimum(second, np.maximum(least, apart))
-            least = np.minimum(least, apart)
-        return np.asarray(np.where(np.isfinite(second), np.float32(0.5) * (least + second), least))
+    def compared(self, rho: Map) -> Comparison:
+        """How the references look at other ranges, in the light of `rho` (1/m), what was measured.
 
-    def agreement(self, rho: Map) -> tuple[Map, Map]:
-        """Least and most difference in grey, of the references, of each pixel by itself if it lies
-        at `rho`: grey levels less what is round about, float32 of the grid's shape.
+        A reference without contrast shows nothing that could be compared; the nearest always
+        counts.
         """
-        least, most = np.full_like(rho, _MOST_GREY), np.zeros_like(rho)
-        for view, view_mean, gain, baseline in self._comparable(rho):
-            rows_in_parallel(_agree, len(rho), self.view, self._mean, view, view_mean, gain, rho,
-                             baseline, least, most)
-        return least, most
-
-    def _comparable(self, rho: Map) -> Iterator[tuple[Image8, Map, np.float32, np.float32]]:
-        """The nearest reference and all others that have contrast, each as seen if it lies at
-        `rho`, its mean, gain, and baseline (0: the nearest, which counts everywhere).
-        """
+        seen, wide = [], round(_LIGHT * self.grid.height / 2) * 2 + 1
         for n, (image, pose) in enumerate(self._references):
             view = reference_in_relief(image, pose, self.grid, self.axes, rho)
-            view_mean = _mean(view)
-            gain = _gain(self.view, self._mean, view, view_mean)
+            gain = _gain(self.view, self._mean, view, _mean(view))
             if n == 0 or gain < _MOST_GAIN:
-                yield view, view_mean, gain, np.float32(pose.baseline if n else 0)
+                light = np.empty_like(rho)
+                rows_in_parallel(_in_light, len(rho), self.view, view, gain, light)
+                light = np.asarray(cv2.blur(light, (wide, wide)))
+                seen.append(_InLight(image, pose, self.view - light, gain,
+                                     np.float32(pose.baseline if n else 0)))
+        return Comparison(self.grid, self.axes, seen)
 
     def _difference(self, image: Image8, pose: RelativePose, rho: Map) -> tuple[Map, Map, Map]:
         view = reference_in_relief(image, pose, self.grid, self.axes, rho)
@@ -304,3 +296,55 @@ class JointRefinement:
                          error, squared)
         fit = cv2.boxFilter(squared, -1, (_FIT_WINDOW, _FIT_WINDOW))
         return slope, error, fit
+
+
+@dataclass(frozen=True)
+class _InLight:
+    """A reference; what `gain` times its view should be, float32 on the grid; and its baseline
+    (0: the nearest, which counts everywhere).
+    """
+
+    image: Image8
+    pose: RelativePose
+    wanted: Map
+    gain: np.float32
+    baseline: np.float32
+
+
+class Comparison:
+    """How references look if what was measured lies elsewhere.
+
+    Their light (gain, and what differs over a wide window) is that of what was measured: means at
+    a supposed range would be of other things wherever only a part of them lies there.
+    """
+
+    def __init__(self, grid: PolarGrid, axes: Floats, references: Sequence[_InLight]) -> None:
+        self._grid, self._axes, self._references = grid, axes, references
+
+    def difference(self, rho: Map, window: int) -> Map:
+        """Mean difference in grey, in windows of `window` px, if it lies at `rho`, of the two
+        references that differ least: grey levels, of the grid's shape.
+        """
+        least = second = np.full_like(rho, np.inf)
+        for reference, view in self._views(rho):
+            apart = np.empty_like(rho)
+            rows_in_parallel(_apart, len(rho), reference.wanted, view, reference.gain,
+                             np.float32(_MOST_APART), apart)
+            apart = np.asarray(cv2.blur(apart, (window, window)))
+            second = np.minimum(second, np.maximum(least, apart))
+            least = np.minimum(least, apart)
+        return np.asarray(np.where(np.isfinite(second), np.float32(0.5) * (least + second), least))
+
+    def agreement(self, rho: Map) -> tuple[Map, Map]:
+        """Least and most difference in grey, of the references, of each pixel by itself if it lies
+        at `rho`: grey levels, float32 of the grid's shape.
+        """
+        least, most = np.full_like(rho, _MOST_GREY), np.zeros_like(rho)
+        for reference, view in self._views(rho):
+            rows_in_parallel(_agree, len(rho), reference.wanted, view, reference.gain, rho,
+                             reference.baseline, least, most)
+        return least, most
+
+    def _views(self, rho: Map) -> Iterator[tuple[_InLight, Image8]]:
+        for r in self._references:
+            yield r, reference_in_relief(r.image, r.pose, self._grid, self._axes, rho)

@@ -15,7 +15,6 @@ from .alternatives import round_about
 from .frames import Image8
 from .jit import fast_kernel, kernel, rows_in_parallel
 from .refinement import JointRefinement
-from .reliability import NEAR_BY
 from .warp import Map
 
 _NEARER, _FARTHER = 15, (9, 15, 31)  # px: windows of what is round about
@@ -24,7 +23,7 @@ _KEEP = 0.5  # grey levels, by which another range must look better
 _FAR = 80.0  # baselines of the nearest reference: farther away, neighbours may decide alone
 # Neighbours of different ranges cost so many grey levels a unit, up to so many units (a share of
 # the range, or a pixel of the longest baseline); less where grey changes, to half at _EDGE.
-_CHANGE, _MOST, _SHARE, _EDGE = 8.0, 3.0, 0.1, 10.0
+_CHANGE, _MOST, _SHARE, _EDGE = 16.0, 3.0, 0.1, 10.0
 _NEVER = 1e6
 _COUNT = 2 + len(_FARTHER)
 
@@ -36,12 +35,11 @@ def _keep_rows(first: int, last: int, rho: Map, nearest: np.float32,
     keep, never = np.float32(_KEEP), np.float32(_NEVER)
     for i in range(first, last):
         for j in range(rho.shape[1]):
-            own = rho[i, j, 0] * nearest
-            near_by, far = own * np.float32(NEAR_BY) > 1, own * np.float32(_FAR) < 1
+            far = rho[i, j, 0] * nearest * np.float32(_FAR) < 1
             for k in range(1, _COUNT):
-                worse = cost[i, j, k] + keep >= cost[i, j, 0]
+                worse = cost[i, j, k] >= cost[i, j, 0]
                 farther = rho[i, j, k] < rho[i, j, 0]
-                held = near_by or (farther and worse and not far)
+                held = farther and worse and not far
                 cost[i, j, k] += never if held else keep
 
 
@@ -127,8 +125,9 @@ def own_surface(rho: Map, refinement: JointRefinement) -> Map:
     """
     nearer, farther = round_about(rho, refinement.grid, _NEARER, _FARTHER)
     found, cost = (np.empty((*rho.shape, _COUNT), np.float32) for _ in range(2))
+    compared = refinement.compared(rho)
     for k, candidate in enumerate((rho, nearer, *farther)):
-        found[..., k], cost[..., k] = candidate, refinement.difference(candidate, _WINDOW)
+        found[..., k], cost[..., k] = candidate, compared.difference(candidate, _WINDOW)
     baselines = np.array([min(refinement.baselines), max(refinement.baselines)], np.float32)
     sine = np.abs(np.sin(refinement.grid.theta())).astype(np.float32)
     rows_in_parallel(_keep_rows, len(cost), found, baselines[0], cost)

@@ -24,13 +24,14 @@ from .reliability import TAIL, Look, _geometry, logarithms
 from .warp import Map, PolarGrid
 
 CHANNELS = 60
-_TOLD = 7  # outputs for each pixel
+_TOLD = 12  # outputs for each pixel
 BLOCK = 32  # px at half size: what the network halves five times
 _ROUND = 64  # px at half size that it sees beyond the seam
 ADDED = np.float32(0.1)  # px of the shortest baseline, before a parallax's logarithm is taken
 _LEAST = np.float32(1e-3)  # px that are told at least
 # Inputs that tell how alternatives differ in grey, of four pixels each, and their inverse range.
-GREY, _SHARE = (25, 29, 33, 38, 43, 47, 51, 55), (37, 42, 59)
+GREY, SHARES = (25, 29, 33, 38, 43, 47, 51, 55), (37, 42, 59)
+ABOVE = np.float32(1.1)  # added to a share, before its logarithm is taken
 _LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24, *range(25, 60))  # of the inputs
 
 
@@ -79,7 +80,7 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
     x[24, p] = np.float32(0.05) + half[13, h, w]
     for k in range(3):
         share = others[8 + k][2 * h, 2 * w] / units[2 * h, 2 * w]
-        x[_SHARE[k], p] = np.float32(1.1) + min(max(share, -one), np.float32(20))
+        x[SHARES[k], p] = ABOVE + min(max(share, -one), np.float32(20))
 
 
 @fast_kernel
@@ -152,9 +153,9 @@ def _network() -> Convolutions:
 
 
 def judged(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """The network's outputs: float32 (7, *shape); three as of `reliability.percentiles`, the
-    logarithm by which the completed parallax (see `completed`) is larger than the measured one,
-    and the same three of its error.
+    """The network's outputs: float32 (12, *shape); three as of `reliability.percentiles`, the
+    logarithm by which a parallax of its own is larger than the measured one, the same three of
+    what `likeliest` gives, and five by which that is chosen.
 
     x : of `inputs`
     shape : of the polar grid
@@ -164,14 +165,41 @@ def judged(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32
     return np.ascontiguousarray(parts.transpose(0, 3, 1, 4, 2)).reshape(_TOLD, *shape)
 
 
-def completed(larger: Map, unit: Map, grid: PolarGrid,
-              baselines: Sequence[float]) -> tuple[Map, Map]:
-    """The inverse range that what is round about suggests, and its unit; 1/m, of grid.shape.
+@fast_kernel
+def _likeliest_rows(first: int, last: int, told: NDArray[np.float32], unit: Map, measured: Map,
+                    near: Map, far: Map, farther: Map, pixel: Map, baselines: Map, out: Map,
+                    its_unit: Map) -> None:  # pragma: no cover - compiled
+    for i in range(first, last):
+        for j in range(out.shape[1]):
+            best = 0
+            for k in range(1, 5):
+                if told[7 + k, i, j] > told[7 + best, i, j]:
+                    best = k
+            if best == 0:
+                rho = measured[i, j]
+            elif best == 1:
+                rho = near[i, j]
+            elif best == 2:
+                rho = far[i, j]
+            elif best == 3:
+                rho = farther[i, j]
+            else:
+                pixels = (ADDED + unit[i, j] * (baselines[0] / pixel[j])) * np.exp(
+                    told[3, i, j]) - ADDED
+                rho = max(pixels, _LEAST) * (pixel[j] / baselines[0])
+            out[i, j] = rho
+            its_unit[i, j] = max(rho, pixel[j] / baselines[1])
 
-    larger : of `judged`; unit : of `reliability.percentiles`
+
+def likeliest(told: NDArray[np.float32], unit: Map, others: Alternatives, grid: PolarGrid,
+              baselines: Sequence[float]) -> tuple[Map, Map]:
+    """The inverse range that is likeliest by what is round about, and its unit, 1/m: what was
+    measured, what lies nearest or farthest round about, or the network's own.
+
+    told : of `judged`; unit : of `reliability.percentiles`; others : to what was measured
     """
     sine, scale = _geometry(grid, baselines)
-    pixel = scale[0] / sine  # 1/m of a pixel, times the baseline
-    pixels = (ADDED + unit * (scale[1] / pixel)) * np.exp(larger) - ADDED
-    rho = np.maximum(pixels, _LEAST) * (pixel / scale[1])
-    return np.asarray(rho, np.float32), np.asarray(np.maximum(rho, pixel / scale[2]), np.float32)
+    rho, its_unit = np.empty_like(unit), np.empty_like(unit)
+    rows_in_parallel(_likeliest_rows, len(unit), told, unit, others.measured.rho, others.near.rho,
+                     others.far.rho, others.farther.rho, scale[0] / sine, scale[1:], rho, its_unit)
+    return rho, its_unit
