@@ -40,6 +40,7 @@ _WINDOWS = {'joint': (9, 9), 'joint_fast': (9,)}
 # _TALL rows: less where there are fewer, for it must not see across what is there.
 _LAST, _LAST_LEVEL = 9, (9, 15)
 _ALONE, _ALONE_LEVEL, _TALL = 21, (15, 25), 960
+_LEAST_CONTRAST = 0.1  # of the current frame's: with less, a reference shows nothing
 _CELL, _SPREADS = 8, (1.0, 6.0)  # px, cells: how what was not matched is filled for a start
 
 
@@ -74,6 +75,14 @@ def _stretched(pose: RelativePose, times: float) -> RelativePose:
         stretch = np.diag([1.0, 1.0, 1.0, *[times] * 3])
         covariance = stretch @ pose.covariance @ stretch
     return RelativePose(pose.rotation, times * pose.position, covariance)
+
+
+def _showing(current: Frame, references: Sequence[Reference]) -> list[Reference]:
+    """The nearest, and all others that show something: without contrast they would only mislead.
+    """
+    least = _LEAST_CONTRAST * float(current.image[::4, ::4].std())
+    return [r for n, r in enumerate(references)
+            if n == 0 or float(r.frame.image[::4, ::4].std()) > least]
 
 
 def _by_nearest(references: Sequence[Reference],
@@ -201,7 +210,7 @@ class JointMatcher:
 
         What is found counts in nearest baselines until it is put back on the sphere.
         """
-        pairs, unit = _by_nearest(references)
+        pairs, unit = _by_nearest(_showing(current, references))
         height = current.image.shape[0]
         grid = stereo_grid(height)
         axes = polar_axes(pairs[0][1].direction)
