@@ -35,6 +35,17 @@ def test_references_differ_least_where_things_are():
     assert (true[0] <= true[1]).all()
 
 
+def test_the_truth_looks_better_than_what_was_measured_wrong():
+    """The light is that of what was measured, but takes no more than what changes slowly."""
+    view = seen()
+    theta = view.theta()
+    inside = (theta > 20) & (theta < 160)
+    wrong = (1.4 * view.rho()).astype(np.float32)
+    compared = refinement_of(view).compared(wrong)
+    there, measured = (compared.agreement(rho)[0][inside] for rho in (view.rho(), wrong))
+    assert np.median(there) < 0.75 * np.median(measured)
+
+
 def test_of_the_references_the_one_that_fits_best_and_worst():
     view = seen()
     rho = (1.2 * view.rho()).astype(np.float32)
