@@ -53,8 +53,9 @@ def test_a_fit_tells_a_range_of_its_own():
     x = rng.normal(0, 0.1, (CHANNELS, 64, 64)).astype(np.float32)
     x[5:9], x[10:14, :, 32:] = 0, 1  # logarithm of what was measured; grey
     true = np.where(np.arange(128) < 64, 0.5, 1.5)[None] * np.ones((128, 1))
-    maps = [m.astype(np.float16) for m in (0 * true, true, 1 + 0 * true)]
-    parts = fit([Patch(x.astype(np.float16), *maps, 1.0)], 200, rng)
+    error = (np.exp(true) - 0.1) / 0.9 - 1  # 0.9 px were measured
+    maps = [m.astype(np.float16) for m in (error, true, 1 + 0 * true)]
+    parts = fit([Patch(x.astype(np.float16), *maps, 1.0)], 320, rng)
     with torch.no_grad():
         out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
     larger, likely = out[12:16].mean(0), np.exp(out[16:20].mean(0))
@@ -73,7 +74,7 @@ def test_a_fit_chooses():
     x[37], x[42], x[59] = np.log(1.1 + 2), np.log(1.1 + 0.4), np.log(1.1 + 0.2)  # shares of it
     right = np.where(np.arange(128) < 64, 1, 0.4)[None] * np.ones((128, 1))
     maps = [m.astype(np.float16) for m in (right - 1, np.log(0.1 + right), 1 + 0 * right)]
-    parts = fit([Patch(x.astype(np.float16), *maps, 0.1)], 200, rng)
+    parts = fit([Patch(x.astype(np.float16), *maps, 0.1)], 320, rng)
     with torch.no_grad():
         out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
     choice = out[28:48].reshape(5, 4, *out.shape[1:]).argmax(0)
