@@ -45,7 +45,8 @@ _FLOOR = 0.17  # px: no match beats that
 
 @dataclass(frozen=True)
 class Found:
-    """What is known of a window on its polar grid, before it is judged.
+    """What is known of a window on its polar grid, before it is judged; m are units of the poses,
+    in a `JointMatcher` nearest baselines.
 
     view : the current view; now, before : it and the nearest reference's, in one light; refined :
     the measurement; other : second opinion, 1/m; matched, parallax : what the nearest pair's

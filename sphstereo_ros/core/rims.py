@@ -4,8 +4,8 @@ Windows see across rims, so what is farther has the range of what is nearer besi
 wide: a far street between leaves would be as near as they are. Each pixel chooses between its own
 range and those round about (`alternatives`), by how the references look if it lies there and by
 what its neighbours choose: as in semi-global matching (Hirschmüller 2008), with candidates in
-place of levels, as in fusion moves (Lempitsky et al. 2010). What is near by keeps its range; what
-is not far is put farther only where that looks better, whatever its neighbours choose.
+place of levels, as in fusion moves (Lempitsky et al. 2010). What is not far is put farther only
+where that looks better by itself, whatever its neighbours choose.
 """
 from __future__ import annotations
 
