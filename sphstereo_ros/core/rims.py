@@ -4,8 +4,8 @@ Windows see across rims, so what is farther has the range of what is nearer besi
 wide: a far street between leaves would be as near as they are. Each pixel chooses between its own
 range and those round about (`alternatives`), by how the references look if it lies there and by
 what its neighbours choose: as in semi-global matching (Hirschmüller 2008), with candidates in
-place of levels, as in fusion moves (Lempitsky et al. 2010). What is not far is put farther only
-where that looks better by itself, whatever its neighbours choose.
+place of levels, as in fusion moves (Lempitsky et al. 2010). It is put farther only where that
+looks better by itself, whatever its neighbours choose.
 """
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from .warp import Map
 _NEARER, _FARTHER = 15, (9, 15, 31)  # px: windows of what is round about
 _WINDOW = 5  # px, in which views are compared
 _KEEP = 0.5  # grey levels, by which another range must look better
-_FAR = 80.0  # baselines of the nearest reference: farther away, neighbours may decide alone
 # Neighbours of different ranges cost so many grey levels a unit, up to so many units (a share of
 # the range, or a pixel of the longest baseline); less where grey changes, to half at _EDGE.
 _CHANGE, _MOST, _SHARE, _EDGE = 16.0, 3.0, 0.1, 10.0
@@ -29,18 +28,15 @@ _COUNT = 2 + len(_FARTHER)
 
 
 @fast_kernel
-def _keep_rows(first: int, last: int, rho: Map, nearest: np.float32,
-               cost: Map) -> None:  # pragma: no cover - compiled
+def _keep_rows(first: int, last: int, rho: Map, cost: Map) -> None:  # pragma: no cover - compiled
     """What another range than the pixel's own, the first, costs besides."""
     keep, never = np.float32(_KEEP), np.float32(_NEVER)
     for i in range(first, last):
         for j in range(rho.shape[1]):
-            far = rho[i, j, 0] * nearest * np.float32(_FAR) < 1
             for k in range(1, _COUNT):
                 worse = cost[i, j, k] >= cost[i, j, 0]
                 farther = rho[i, j, k] < rho[i, j, 0]
-                held = farther and worse and not far
-                cost[i, j, k] += never if held else keep
+                cost[i, j, k] += never if farther and worse else keep
 
 
 @fast_kernel
@@ -128,11 +124,11 @@ def own_surface(rho: Map, refinement: JointRefinement) -> Map:
     compared = refinement.compared(rho)
     for k, candidate in enumerate((rho, nearer, *farther)):
         found[..., k], cost[..., k] = candidate, compared.difference(candidate, _WINDOW)
-    baselines = np.array([min(refinement.baselines), max(refinement.baselines)], np.float32)
+    longest = np.float32(max(refinement.baselines))
     sine = np.abs(np.sin(refinement.grid.theta())).astype(np.float32)
-    rows_in_parallel(_keep_rows, len(cost), found, baselines[0], cost)
+    rows_in_parallel(_keep_rows, len(cost), found, cost)
     unit = np.maximum(np.float32(_SHARE) * rho, np.float32(refinement.grid.pixel) / (
-        baselines[1] * np.maximum(sine, np.float32(0.02))))
+        longest * np.maximum(sine, np.float32(0.02))))
     total = np.zeros_like(cost)
     rows_in_parallel(_along_rows, len(cost), cost, found, unit, refinement.view, total)
     rows_in_parallel(_across_rows, cost.shape[1], cost, found, unit, refinement.view, total)
