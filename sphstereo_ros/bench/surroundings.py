@@ -48,7 +48,10 @@ from .accuracy import as_frame
 from .reliability import MOST, PERCENTILES, Watched, disturbed
 from .unet import Design, Parameters, fit_arguments, percentile_loss, save_fit
 
-_SEEDS, _PAIR_SEEDS = range(11, 61), range(61, 81)
+_SEEDS, _PAIR_SEEDS, _SLOW_SEEDS, _HARD_SEEDS = (
+    range(11, 61), range(61, 81), range(82, 98), range(121, 141))
+_SLOW = (0.05, 0.1, 0.07)  # m from frame to frame
+_HARD = ('repetition', 'wall', 'traffic', 'occlusion')
 _RENDERED = (1, 7, 10, 11)  # frames of a sequence
 # Windows by how many frames a sequence has: current frame, and the references' places.
 _WINDOWS = {2: ((0, (1,)),), 4: ((3, (2, 1, 0)), (3, (2, 1)), (3, (2,))),
@@ -57,7 +60,7 @@ _WINDOWS = {2: ((0, (1,)),), 4: ((3, (2, 1, 0)), (3, (2, 1)), (3, (2,))),
 _TURNED = 4.0  # degrees about each axis at most, of a pair's top camera
 # Weights of what is 10 to 100 m away, and of what is near but was found far.
 _RARE, _TOO_FAR = 2.0, 2.0
-_WIDTHS = (24, 32, 48, 64, 64, 64)  # channels at half size, a quarter, …
+_WIDTHS = (32, 32, 48, 64, 64, 64)  # channels at half size, a quarter, …
 _LAST = 32
 _BEGIN = -2.3  # logarithm of the error that it starts from
 _ROWS, _COLUMNS, _BATCH, _RATE = 192, 256, 3, 1e-3
@@ -72,7 +75,7 @@ _OF_ERROR, _CHOSEN = len(PERCENTILES), 2 + len(SHARES)
 _OWN, _LIKELIEST, _CHOICES = _OF_ERROR, _OF_ERROR + 1, 2 * _OF_ERROR + 1  # outputs
 DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
                 [_BEGIN] * (4 * _OF_ERROR) + [0.0] * 4 + [_BEGIN] * (4 * _OF_ERROR)
-                + [2.0] * 4 + [0.0] * (4 * (_CHOSEN - 1)))
+                + [2.0] * 4 + [0.0] * (4 * (_CHOSEN - 1)), deep=True)
 
 
 @dataclass(frozen=True)
@@ -152,6 +155,10 @@ def _render_ways(folder: Path) -> None:
         jobs.append(('street', seed, spacing, nuisance))
         jobs += [('takeoff', seed, None, None)] * (seed % 3 == 0 or seed > 25)
         jobs += [('corridor', seed, None, None)] * (seed % 5 == 0)
+    for seed in _SLOW_SEEDS:
+        jobs.append(('street', seed, _SLOW[(seed if seed % 2 else seed // 2) % 3], None))
+    for seed in _HARD_SEEDS:
+        jobs.append(('street', seed, None, _HARD[seed % 4]))
     for name, seed, step, nuisance in tqdm(jobs, unit='scene'):
         height = 960 if name != 'corridor' and seed % 3 else 480
         render_way(folder, name, seed, height, step, nuisance)

@@ -31,6 +31,7 @@ class Design:
 
     begin : biases of the outputs to start from
     step : 1, or 2 where the first size is half of the input's
+    deep : whether there is a second layer at the first size before it is halved
     """
 
     channels: int
@@ -38,11 +39,14 @@ class Design:
     last: int
     begin: Sequence[float]
     step: int = 1
+    deep: bool = False
 
     @property
     def layers(self) -> dict[str, tuple[int, int, int, int]]:
         """Inputs, outputs, size of the kernel and step of each layer, by name."""
         found = {'enter': (self.channels, self.widths[0], 3, self.step)}
+        if self.deep:
+            found['stay0'] = (self.widths[0], self.widths[0], 3, 1)
         for n, (fine, coarse) in enumerate(itertools.pairwise(self.widths), 1):
             found[f'down{n}'], found[f'stay{n}'] = (fine, coarse, 3, 2), (coarse, coarse, 3, 1)
             found[f'up{n - 1}'] = (coarse, fine, 1, 1)
@@ -50,12 +54,15 @@ class Design:
         return found | {'tell': (self.last, len(self.begin), 1, 1)}
 
     def begun(self, generator: Any) -> Parameters:
-        """Weights to start from (He et al. 2015)."""
+        """Weights to start from (He et al. 2015); a second layer at first passes on what it gets.
+        """
         import torch
         made = {}
         for name, (inside, outside, size, _) in self.layers.items():
             spread = 0.01 if name == 'tell' else np.sqrt(2 / (inside * size**2))
             weight = spread * torch.randn(outside, inside, size, size, generator=generator)
+            if name == 'stay0':
+                weight = torch.nn.init.dirac_(weight)
             bias = torch.tensor(self.begin) if name == 'tell' else torch.zeros(outside)
             made[f'{name}.weight'] = weight.requires_grad_()
             made[f'{name}.bias'] = bias.float().requires_grad_()
@@ -70,6 +77,8 @@ class Design:
         """
         deepest = len(self.widths) - 1
         levels = [bent(layer('enter', x))]
+        if self.deep:
+            levels[0] = bent(layer('stay0', levels[0]))
         for n in range(1, deepest + 1):
             levels.append(bent(layer(f'stay{n}', bent(layer(f'down{n}', levels[-1])))))
         y = levels[deepest]
@@ -102,12 +111,14 @@ class Design:
 
         draw : gives a sample: x, and what else the loss asks for; `batch` of them make a step
         loss : (outputs, what else was drawn) → how wrong they are
-        start : one that saw and told less goes on, too
+        start : one that saw and told less, or had fewer channels, goes on, too
         rate : of learning; of one that goes on with new outputs, 3e-3 diverged
         """
         import torch
         parts = self.begun(torch.Generator().manual_seed(0))
         for name, value in (start or {}).items():
+            if value.ndim > 1:
+                parts[name].data[:, value.shape[1]:] = 0  # what is new changes nothing yet
             parts[name].data[tuple(slice(n) for n in value.shape)] = torch.from_numpy(value.copy())
         adam = torch.optim.Adam(parts.values(), rate)
         progress = tqdm(range(steps), unit='step')

@@ -34,7 +34,7 @@ _TAIL = 0.75  # of what is published
 # likely, and differs by such a share; not where the nearest reference shows something else, or has
 # fewer px of parallax: it shows the same then whatever is there; nor where less than such a share
 # of what is round about (of the grid's height) is sure.
-_SURE_COMPLETED, _DIFFERS, _SHOWS = 0.2, 0.03, 1.0
+_SURE_COMPLETED, _DIFFERS, _SHOWS = 0.3, 0.03, 1.0
 _AMID, _ROUND = 0.15, 1 / 15
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
