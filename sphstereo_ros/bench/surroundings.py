@@ -50,7 +50,7 @@ from .unet import Design, Parameters, fit_arguments, percentile_loss, save_fit
 
 _SEEDS, _PAIR_SEEDS, _SLOW_SEEDS, _HARD_SEEDS = (
     range(11, 61), range(61, 81), range(82, 98), range(121, 141))
-_SLOW = (0.05, 0.1, 0.07)  # m from frame to frame
+_SLOW = (0.05, 0.1, 0.07)  # m from frame to frame; odd and even seeds differ, as heights go by 3
 _HARD = ('repetition', 'wall', 'traffic', 'occlusion')
 _RENDERED = (1, 7, 10, 11)  # frames of a sequence
 # Windows by how many frames a sequence has: current frame, and the references' places.
