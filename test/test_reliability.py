@@ -1,6 +1,7 @@
 """How far a measurement errs, by its looks."""
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -11,7 +12,7 @@ from sphstereo_ros.core import judgement
 from sphstereo_ros.core.alternatives import Alternative, Alternatives
 from sphstereo_ros.core.judgement import Found, by_looks
 from sphstereo_ros.core.matching import UNKNOWN, Parallax, stereo_grid
-from sphstereo_ros.core.refinement import Refined
+from sphstereo_ros.core.refinement import Agreement, Refined
 from sphstereo_ros.core.reliability import (
     LEAST,
     LOOKS,
@@ -46,9 +47,14 @@ def found(rng: np.random.Generator, scale: float = 1.0):
 def others_of(refined: Refined) -> Alternatives:
     """To what was measured, as differ from place to place as that."""
     rho, misfit = refined.rho, refined.misfit / 5
-    return Alternatives(*(Alternative(share * rho, least * misfit, most * misfit) for
-                          share, least, most in ((1, 0.3, 1.1), (1.6, 0.9, 1.2), (0.4, 1, 1.3),
-                                                 (0.2, 0.8, 1.4))))
+    half = cv2.resize(misfit, tuple(n // 2 for n in misfit.shape[::-1]))
+
+    def alternative(share: float, least: float, most: float) -> Alternative:
+        typical = (0.7 * least + 0.3 * most) * misfit
+        return Alternative(share * rho, Agreement(least * misfit, most * misfit, typical,
+                                                  least * half))
+    return Alternatives(*(alternative(*shares) for shares in (
+        (1, 0.3, 1.1), (1.6, 0.9, 1.2), (0.4, 1, 1.3), (0.2, 0.8, 1.4), (1.1, 0.4, 1.3))))
 
 
 def everywhere() -> tuple[np.ndarray, np.ndarray]:

@@ -20,7 +20,7 @@ from sphstereo_ros.core.frames import Reference
 from sphstereo_ros.core.joint import JointMatcher
 from sphstereo_ros.core.judgement import together
 from sphstereo_ros.core.matching import UNKNOWN, matcher
-from sphstereo_ros.core.refinement import Refined
+from sphstereo_ros.core.refinement import Agreement, Refined
 from sphstereo_ros.core.reliability import look, network, percentiles
 from sphstereo_ros.core.surroundings import CHANNELS, inputs, judged, likeliest
 from sphstereo_ros.scenes.binocular import render_binocular, save_binocular
@@ -52,6 +52,7 @@ def test_the_inputs_of_a_pixel(h, w):
     rho, units, grey = refined.rho[block], unit[block], (view[block] / 64.0 - 2)
     known = matched[block] != UNKNOWN
     others = others_of(refined)
+    measured, near, far, farther, swept = (a.agreement for a in vars(others).values())
 
     def grey_of(difference):
         return np.log(2 + difference[block].ravel()) - 2
@@ -69,11 +70,15 @@ def test_the_inputs_of_a_pixel(h, w):
              0.2 * np.log(0.01 + mean(refined.information[block] * units**2)),
              0.5 * np.log(0.1 + mean(long)), mean(sine), np.ptp(grey),
              np.log(0.05 + seen.half[13, h, w]) + 1,
-             *grey_of(others.measured.least), *grey_of(others.measured.most),
-             *grey_of(others.near.least), share_of(others.near),
-             *grey_of(others.far.least), share_of(others.far),
-             *grey_of(others.near.most), *grey_of(others.far.most), *grey_of(others.farther.least),
-             *grey_of(others.farther.most), share_of(others.farther)]
+             *grey_of(measured.least), *grey_of(measured.most),
+             *grey_of(near.least), share_of(others.near),
+             *grey_of(far.least), share_of(others.far), *grey_of(near.most),
+             *grey_of(far.most), *grey_of(farther.least), *grey_of(farther.most),
+             share_of(others.farther), *grey_of(measured.typical),
+             *grey_of(near.typical), *grey_of(far.typical), *grey_of(farther.typical),
+             *grey_of(swept.least), *grey_of(swept.most), *grey_of(swept.typical),
+             share_of(others.swept),
+             *(np.log(2 + a.around[h, w]) - 2 for a in (measured, near, far, farther, swept))]
     assert len(exact) == CHANNELS
     np.testing.assert_allclose(out[0, :, ROUND + h, w], exact, rtol=1e-4, atol=1e-4)
 
@@ -91,7 +96,7 @@ def test_sizes_halve_evenly():
     out, seen, told, _ = seen_at(found(np.random.default_rng(3)))
     assert out.shape[2] % BLOCK == out.shape[3] % BLOCK == 0
     assert out.shape[2] >= seen.half.shape[1] + 2 * ROUND
-    assert judged(out, GRID.shape).shape == (12, *told.shape[1:])
+    assert judged(out, GRID.shape).shape == (13, *told.shape[1:])
 
 
 @settings(max_examples=8, deadline=None)
@@ -130,8 +135,8 @@ def test_a_view_that_is_turned_is_judged_as_before():
 
 
 def told_of(choice: np.ndarray, larger: np.ndarray | float = 0.0) -> np.ndarray:
-    """What the network tells, if of five ranges it chooses that one."""
-    told = np.zeros((12, *GRID.shape), np.float32)
+    """What the network tells, if of six ranges it chooses that one."""
+    told = np.zeros((13, *GRID.shape), np.float32)
     told[3] = larger
     np.put_along_axis(told, 7 + choice[None], np.float32(1), 0)
     return told
@@ -158,10 +163,11 @@ def test_the_networks_own_range_is_as_much_larger_as_told(seed, scale):
 @given(st.integers(0, 1000))
 def test_the_likeliest_is_what_was_chosen(seed):
     rng = np.random.default_rng(seed)
-    ranges = rng.uniform(0.01, 2, (4, *GRID.shape)).astype(np.float32)
-    others = Alternatives(*(Alternative(m, m, m) for m in ranges))
-    choice = rng.integers(0, 4, GRID.shape)
-    rho, unit = likeliest(told_of(choice), ranges[0], others, GRID, BASELINES)
+    ranges = rng.uniform(0.01, 2, (5, *GRID.shape)).astype(np.float32)
+    others = Alternatives(*(Alternative(m, Agreement(m, m, m, m)) for m in ranges))
+    choice = rng.integers(0, 5, GRID.shape)
+    told = told_of(np.where(choice < 4, choice, 5))  # the fifth is the network's own
+    rho, unit = likeliest(told, ranges[0], others, GRID, BASELINES)
     np.testing.assert_array_equal(rho, np.take_along_axis(ranges, choice[None], 0)[0])
     assert (unit >= rho).all()
 
@@ -203,7 +209,7 @@ def test_sky_behind_leaves_is_refused(monkeypatch, references, least):
     assert known > least
     # A network that believes everything leaves the decision to what a pixel tells by itself.
     monkeypatch.setattr(judgement, 'judged', lambda x, shape: np.broadcast_to(
-        np.float32([-9, -9, -9, 0, 9, 9, 9, 9, 0, 0, 0, 0])[:, None, None], (12, *shape)))
+        np.float32([-9, -9, -9, 0, 9, 9, 9, 9, 0, 0, 0, 0, 0])[:, None, None], (13, *shape)))
     alone, _ = believed()
     assert ghosts < 0.25 * alone
 

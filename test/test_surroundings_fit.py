@@ -59,7 +59,7 @@ def test_a_fit_tells_a_range_of_its_own():
     with torch.no_grad():
         out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
     larger, likely = out[12:16].mean(0), np.exp(out[16:20].mean(0))
-    choice = out[28:48].reshape(5, 4, *out.shape[1:]).argmax(0)
+    choice = out[28:52].reshape(6, 4, *out.shape[1:]).argmax(0)
     assert (choice == 4).mean() > 0.9
     assert np.median(np.abs(larger[:, 4:28] - 0.5)) < 0.1
     assert np.median(np.abs(larger[:, 36:60] - 1.5)) < 0.1
@@ -77,7 +77,7 @@ def test_a_fit_chooses():
     parts = fit([Patch(x.astype(np.float16), *maps, 0.1)], 320, rng)
     with torch.no_grad():
         out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
-    choice = out[28:48].reshape(5, 4, *out.shape[1:]).argmax(0)
+    choice = out[28:52].reshape(6, 4, *out.shape[1:]).argmax(0)
     assert np.isin(choice[:, :, 4:28], (0, 4)).mean() > 0.9
     assert np.isin(choice[:, :, 36:60], (2, 4)).mean() > 0.9
 

@@ -136,10 +136,11 @@ def loss(out: Any, found: Any, true: Any, weight: Any) -> Any:
 
 
 def fit(patches: Sequence[Patch], steps: int, rng: np.random.Generator,
-        start: dict[str, NDArray[np.float32]] | None = None) -> Parameters:
-    """Weights after so many steps, from `start` if there is one."""
+        start: dict[str, NDArray[np.float32]] | None = None,
+        bfloat16: bool = False) -> Parameters:
+    """Weights after so many steps, as of `Design.fitted`."""
     return DESIGN.fitted(lambda: _varied(patches[int(rng.integers(len(patches)))], rng), loss,
-                         steps, _BATCH, start)
+                         steps, _BATCH, start, bfloat16=bfloat16)
 
 
 def render(folder: Path) -> None:
@@ -163,7 +164,7 @@ def main() -> None:
     if given.command == 'render':
         render(given.folder)
     else:
-        save_fit(given, DESIGN, patches_of, fit)
+        save_fit(given, DESIGN, Patch, patches_of, fit)
 
 
 if __name__ == '__main__':

@@ -1,7 +1,7 @@
 """Fits the network of `sphstereo_ros.core.surroundings` to scenes with exact range.
 
     python -m sphstereo_ros.bench.surroundings render FOLDER
-    python -m sphstereo_ros.bench.surroundings fit OUT.onnx FOLDER...
+    python -m sphstereo_ros.bench.surroundings fit OUT.onnx FOLDER... [--patches DIR]
 
 `render` makes scenes for it alone: of seeds that are neither tuned on nor reported, four frames
 each, or one pair of two cameras. `fit` needs torch and onnx (extra `fit`); the package itself does
@@ -27,6 +27,7 @@ from sphstereo_ros.core.reliability import LEAST, Look, network, percentiles
 from sphstereo_ros.core.surroundings import (
     ABOVE,
     ADDED,
+    AROUND,
     BLOCK,
     CHANNELS,
     GREY,
@@ -102,7 +103,7 @@ class _Kept(Watched):
     _others: Alternatives
 
     def _judged(self, found: Found, refinement: JointRefinement) -> Judged:
-        self._others = alternatives(found.refined.rho, refinement)
+        self._others = alternatives(found.refined.rho, found.other, refinement)
         return super()._judged(found, refinement)
 
     def watch(self, found: Found, seen: Look, grid: PolarGrid, axes: NDArray[np.float64],
@@ -193,8 +194,9 @@ def _render_pairs(folder: Path) -> None:
 
 
 def candidates(x: Any, error: Any, true: Any, own: Any) -> tuple[Any, Any]:
-    """Parallaxes (N, 5, …), px of the shortest baseline, of what may be chosen: what was measured,
-    nearest, farthest, and farthest more widely round about, and the network's own; and the true.
+    """Parallaxes (N, 6, …), px of the shortest baseline, of what may be chosen: what was measured,
+    nearest, farthest, and farthest more widely round about, the network's own, and what was swept;
+    and the true.
 
     own : logarithm of the network's own, and ADDED
     """
@@ -207,7 +209,8 @@ def candidates(x: Any, error: Any, true: Any, own: Any) -> tuple[Any, Any]:
         return functional.interpolate(half, scale_factor=2, mode='nearest')
     shares = [torch.exp(x[:, k:k + 1]) - float(ABOVE) for k in SHARES]
     round_about = [larger(share) * larger(unit[:, :, ::2, ::2]) for share in shares]
-    return torch.cat([pixels - error * unit, *round_about, torch.exp(own) - float(ADDED)],
+    *near_by, swept = round_about
+    return torch.cat([pixels - error * unit, *near_by, torch.exp(own) - float(ADDED), swept],
                      1), pixels
 
 
@@ -242,8 +245,8 @@ def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, ...]:
     x[:, 10:14] = (x[:, 10:14] * gain + offset).clamp(-2, 2)
     x[:, 23] *= gain
     x[:, 14] = torch.log(0.5 + gain * (torch.exp(x[:, 14] + 1) - 0.5).clamp(min=0)) - 1
-    for at in GREY:
-        x[:, at:at + 4] = torch.log(2 + gain * (torch.exp(x[:, at:at + 4] + 2) - 2)) - 2
+    grey = [*(at + n for at in GREY for n in range(4)), *AROUND]
+    x[:, grey] = torch.log(2 + gain * (torch.exp(x[:, grey] + 2) - 2)) - 2
     if rng.random() < 0.15:
         x[:, 10:14] *= -1
     if rng.random() < 0.5:
@@ -280,15 +283,17 @@ def _drawn(patches: Sequence[Patch], rng: np.random.Generator) -> tuple[Any, ...
 
 
 def fit(patches: Sequence[Patch], steps: int, rng: np.random.Generator,
-        start: dict[str, NDArray[np.float32]] | None = None) -> Parameters:
-    """Weights after so many steps, from `start` if there is one.
+        start: dict[str, NDArray[np.float32]] | None = None,
+        bfloat16: bool = False) -> Parameters:
+    """Weights after so many steps, as of `Design.fitted`.
 
     Raises ValueError where of no patch enough of the truth is known.
     """
     known = [p for p in patches if p.weight.mean(dtype=np.float64) > _TRUE]
     if not known:
         raise ValueError('of no patch enough of the truth is known')
-    return DESIGN.fitted(lambda: _drawn(known, rng), loss, steps, _BATCH, start, _RATE)
+    return DESIGN.fitted(lambda: _drawn(known, rng), loss, steps, _BATCH, start, _RATE,
+                         bfloat16)
 
 
 def main() -> None:
@@ -301,7 +306,7 @@ def main() -> None:
     if given.command == 'render':
         render(given.folder)
     else:
-        save_fit(given, DESIGN, patches_of, fit)
+        save_fit(given, DESIGN, Patch, patches_of, fit)
 
 
 if __name__ == '__main__':

@@ -12,41 +12,47 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .refinement import JointRefinement
+from .refinement import Agreement, JointRefinement
 from .warp import Map, PolarGrid
 
 _ROUND, _WIDE, _SPECK = 15, 31, 3  # px: windows of what is round about, and of what is no surface
+_STEADY = 21  # px: window in which the farthest is refined
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """Maps of a polar grid, float32.
-
-    rho : 1/m; least, most : difference in grey, of the references, if it is there (of
-        `Comparison.agreement`)
-    """
+    """rho : 1/m, float32 on a polar grid; agreement : with the references, if it is there."""
 
     rho: Map
-    least: Map
-    most: Map
+    agreement: Agreement
 
 
 @dataclass(frozen=True)
 class Alternatives:
-    """What was measured, nearest and farthest round about, and farthest more widely."""
+    """What was measured, nearest and farthest round about, farthest more widely, and what was
+    swept.
+    """
 
     measured: Alternative
     near: Alternative
     far: Alternative
     farther: Alternative
+    swept: Alternative
 
 
-def alternatives(rho: Map, refinement: JointRefinement) -> Alternatives:
-    """Of what was measured, 1/m."""
-    near, (far, farther) = round_about(rho, refinement.grid, _ROUND, (_ROUND, _WIDE))
+def alternatives(rho: Map, swept: Map, refinement: JointRefinement) -> Alternatives:
+    """To what was measured, `rho`, 1/m.
+
+    The farthest of a window is the most wrong, too, of what lies far: refined, it is what is seen
+    between and behind what is nearer.
+
+    swept : the second opinion, 1/m
+    """
+    near, far = round_about(rho, refinement.grid, _ROUND, (_ROUND, _WIDE))
+    steady = [refinement.refined(m, _STEADY).rho for m in far]
     compared = refinement.compared(rho)
-    return Alternatives(*(Alternative(m, *compared.agreement(m))
-                          for m in (rho, near, far, farther)))
+    return Alternatives(*(Alternative(m, compared.agreement(m))
+                          for m in (rho, near, *steady, swept)))
 
 
 def round_about(rho: Map, grid: PolarGrid, nearer: int,

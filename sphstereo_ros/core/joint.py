@@ -236,7 +236,8 @@ class JointMatcher:
     def _judged(self, found: Found, refinement: JointRefinement) -> Judged:
         grid, baselines = refinement.grid, refinement.baselines
         if self._sweeps:
-            return by_looks(found, alternatives(found.refined.rho, refinement), grid, baselines)
+            others = alternatives(found.refined.rho, found.other, refinement)
+            return by_looks(found, others, grid, baselines)
         return by_agreement(found, found.other, grid, baselines[0], swept=False)
 
     def _swept(self, pairs: Sequence[tuple[Image8, RelativePose]],

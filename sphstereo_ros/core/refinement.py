@@ -8,8 +8,9 @@ do (occluded there, or moved) are left out.
 """
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +25,9 @@ Floats = NDArray[np.float64]
 
 _NOISE = 2.0  # grey levels, of the difference of two views beside what range explains
 _MOST = 400.0  # squared grey levels: a worse difference tells no more than that it does not fit
-_MOST_GREY, _MOST_APART = 60.0, 15.0  # grey levels, of a single pixel; where windows are compared
+_MOST_GREY = 60.0  # grey levels, of a single pixel where ranges are compared
+_HALF = 8.0  # grey levels that count half as much as any difference may
+_AROUND = 1.0  # px at half size: standard deviation of what is round about
 _FIT_WINDOW, _MEAN_WINDOW = 7, 21
 _LIGHT = 1 / 20  # of the grid's height: across it, the light of references may differ
 _HOLD = 1e-3  # information of the start: where nothing is told, it stays
@@ -89,8 +92,10 @@ def _in_light(first: int, last: int, current: Image8, view: Image8, gain: np.flo
 
 @fast_kernel
 def _agree(first: int, last: int, wanted: Map, view: Image8, gain: np.float32, rho: Map,
-           baseline: np.float32, least: Map, most: Map) -> None:  # pragma: no cover - compiled
-    """Take one reference's difference in grey into the least and the most of them.
+           baseline: np.float32, least: Map, most: Map, total: Map,
+           count: Map) -> None:  # pragma: no cover - compiled
+    """Take one reference's difference in grey into the least and the most of them, and into the
+    total of what they count.
 
     Where the reference looks too different, nothing is taken; baseline 0 = it always counts.
     """
@@ -101,15 +106,8 @@ def _agree(first: int, last: int, wanted: Map, view: Image8, gain: np.float32, r
             e = min(abs(wanted[i, j] - gain * np.float32(view[i, j])), np.float32(_MOST_GREY))
             least[i, j] = min(least[i, j], e)
             most[i, j] = max(most[i, j], e)
-
-
-@fast_kernel
-def _apart(first: int, last: int, wanted: Map, view: Image8, gain: np.float32, most: np.float32,
-           out: Map) -> None:  # pragma: no cover - compiled
-    """Difference in grey of one reference, up to `most`."""
-    for i in range(first, last):
-        for j in range(out.shape[1]):
-            out[i, j] = min(abs(wanted[i, j] - gain * np.float32(view[i, j])), most)
+            total[i, j] += e / (e + np.float32(_HALF))
+            count[i, j] += np.float32(1)
 
 
 @fast_kernel
@@ -311,6 +309,27 @@ class _InLight:
     baseline: np.float32
 
 
+@dataclass(frozen=True)
+class Agreement:
+    """Differences in grey of the references: grey levels, float32 of the grid's shape.
+
+    least, most : of the references
+    typical : of all, where a large one counts little more than a fair one: a reference from which
+        something is hidden does little harm, and one that fits by chance little good
+    around : the same round about, at half the size
+    """
+
+    least: Map
+    most: Map
+    typical: Map
+    around: Map
+
+
+def _levels_of(share: NDArray[Any]) -> Map:
+    """Grey levels of a difference that counts so much of what any may."""
+    return np.asarray(np.float32(_HALF) * share / (1 - share), np.float32)
+
+
 class Comparison:
     """How references look if what was measured lies elsewhere.
 
@@ -321,30 +340,26 @@ class Comparison:
     def __init__(self, grid: PolarGrid, axes: Floats, references: Sequence[_InLight]) -> None:
         self._grid, self._axes, self._references = grid, axes, references
 
-    def difference(self, rho: Map, window: int) -> Map:
-        """Mean difference in grey, in windows of `window` px, if it lies at `rho`, of the two
-        references that differ least: grey levels, of the grid's shape.
+    def difference(self, rho: Map, spread: float) -> Map:
+        """How far the references differ round each pixel (Gaussian, of so many px), if it lies at
+        `rho`: a share of what they may, of the grid's shape, as `Agreement.typical`.
         """
-        least = second = np.full_like(rho, np.inf)
-        for reference, view in self._views(rho):
-            apart = np.empty_like(rho)
-            rows_in_parallel(_apart, len(rho), reference.wanted, view, reference.gain,
-                             np.float32(_MOST_APART), apart)
-            apart = np.asarray(cv2.blur(apart, (window, window)))
-            second = np.minimum(second, np.maximum(least, apart))
-            least = np.minimum(least, apart)
-        return np.asarray(np.where(np.isfinite(second), np.float32(0.5) * (least + second), least))
+        return np.asarray(cv2.GaussianBlur(self._compared(rho)[2], (0, 0), spread))
 
-    def agreement(self, rho: Map) -> tuple[Map, Map]:
-        """Least and most difference in grey, of the references, of each pixel by itself if it lies
-        at `rho`: grey levels, float32 of the grid's shape.
-        """
+    def agreement(self, rho: Map) -> Agreement:
+        """How far the references differ from each pixel by itself, if it lies at `rho`."""
+        least, most, share = self._compared(rho)
+        rows, columns = (n // 2 for n in rho.shape)
+        half = cv2.resize(share, (columns, rows), interpolation=cv2.INTER_AREA)
+        around = cv2.GaussianBlur(half, (0, 0), _AROUND)
+        return Agreement(least, most, _levels_of(share), _levels_of(around))
+
+    def _compared(self, rho: Map) -> tuple[Map, Map, Map]:
+        """Least and most difference, grey levels, and the mean share of what it may be."""
         least, most = np.full_like(rho, _MOST_GREY), np.zeros_like(rho)
-        for reference, view in self._views(rho):
-            rows_in_parallel(_agree, len(rho), reference.wanted, view, reference.gain, rho,
-                             reference.baseline, least, most)
-        return least, most
-
-    def _views(self, rho: Map) -> Iterator[tuple[_InLight, Image8]]:
+        total, count = np.zeros_like(rho), np.zeros_like(rho)
         for r in self._references:
-            yield r, reference_in_relief(r.image, r.pose, self._grid, self._axes, rho)
+            view = reference_in_relief(r.image, r.pose, self._grid, self._axes, rho)
+            rows_in_parallel(_agree, len(rho), r.wanted, view, r.gain, rho, r.baseline, least,
+                             most, total, count)
+        return least, most, total / count  # the nearest reference always counts

@@ -18,11 +18,11 @@ from .refinement import JointRefinement
 from .warp import Map
 
 _NEARER, _FARTHER = 15, (9, 15, 31)  # px: windows of what is round about
-_WINDOW = 5  # px, in which views are compared
-_KEEP = 0.5  # grey levels, by which another range must look better
-# Neighbours of different ranges cost so many grey levels a unit, up to so many units (a share of
-# the range, or a pixel of the longest baseline); less where grey changes, to half at _EDGE.
-_CHANGE, _MOST, _SHARE, _EDGE = 16.0, 3.0, 0.1, 10.0
+_SPREAD = 1.3  # px, round which views are compared
+_KEEP = 0.025  # of what views may differ, by which another range must look better
+# Neighbours of different ranges cost so much of it a unit, up to so many units (a share of the
+# range, or a pixel of the longest baseline); less where grey changes, to half at _EDGE levels.
+_CHANGE, _MOST, _SHARE, _EDGE = 0.8, 3.0, 0.1, 10.0
 _NEVER = 1e6
 _COUNT = 2 + len(_FARTHER)
 
@@ -123,7 +123,7 @@ def own_surface(rho: Map, refinement: JointRefinement) -> Map:
     found, cost = (np.empty((*rho.shape, _COUNT), np.float32) for _ in range(2))
     compared = refinement.compared(rho)
     for k, candidate in enumerate((rho, nearer, *farther)):
-        found[..., k], cost[..., k] = candidate, compared.difference(candidate, _WINDOW)
+        found[..., k], cost[..., k] = candidate, compared.difference(candidate, _SPREAD)
     longest = np.float32(max(refinement.baselines))
     sine = np.abs(np.sin(refinement.grid.theta())).astype(np.float32)
     rows_in_parallel(_keep_rows, len(cost), found, cost)

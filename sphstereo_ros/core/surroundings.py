@@ -23,16 +23,18 @@ from .matching import UNKNOWN
 from .reliability import TAIL, Look, _geometry, logarithms
 from .warp import Map, PolarGrid
 
-CHANNELS = 60
-_TOLD = 12  # outputs for each pixel
+CHANNELS = 94
+_TOLD = 13  # outputs for each pixel
 BLOCK = 32  # px at half size: what the network halves five times
 _ROUND = 64  # px at half size that it sees beyond the seam
 ADDED = np.float32(0.1)  # px of the shortest baseline, before a parallax's logarithm is taken
 _LEAST = np.float32(1e-3)  # px that are told at least
-# Inputs that tell how alternatives differ in grey, of four pixels each, and their inverse range.
-GREY, SHARES = (25, 29, 33, 38, 43, 47, 51, 55), (37, 42, 59)
+# Inputs that tell how alternatives differ in grey, of four pixels each, and round about; and their
+# inverse range.
+GREY = (25, 29, 33, 38, 43, 47, 51, 55, 60, 64, 68, 72, 76, 80, 84)
+AROUND, SHARES = (89, 90, 91, 92, 93), (37, 42, 59, 88)
 ABOVE = np.float32(1.1)  # added to a share, before its logarithm is taken
-_LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24, *range(25, 60))  # of the inputs
+_LOGARITHMS = (5, 6, 7, 8, 14, 15, 19, 20, 21, 24, *range(25, CHANNELS))  # of the inputs
 
 
 @fast_kernel
@@ -67,7 +69,7 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
         information += full[4, r, c] * unit * unit
         longest += pixels * scale[2]
         sines += s
-        for k in range(8):
+        for k in range(15):
             x[GREY[k] + n, p] = np.float32(2) + others[k][r, c]
     x[4, p], x[9, p] = quarter * nearer, quarter * sign
     x[14, p] = np.float32(0.5) + half[12, h, w]
@@ -78,9 +80,11 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
     x[21, p] = np.float32(0.1) + quarter * longest
     x[22, p], x[23, p] = quarter * sines, high - low
     x[24, p] = np.float32(0.05) + half[13, h, w]
-    for k in range(3):
-        share = others[8 + k][2 * h, 2 * w] / units[2 * h, 2 * w]
+    for k in range(4):
+        share = others[15 + k][2 * h, 2 * w] / units[2 * h, 2 * w]
         x[SHARES[k], p] = ABOVE + min(max(share, -one), np.float32(20))
+    for k in range(5):
+        x[AROUND[k], p] = np.float32(2) + others[19 + k][h, w]
 
 
 @fast_kernel
@@ -108,9 +112,11 @@ def _input_rows(first: int, last: int, view: Image8, full: NDArray[np.float32],
                 x[20, p] *= np.float32(0.2)
                 x[21, p] *= np.float32(0.5)
                 x[24, p] += np.float32(1)
-                for k in range(8):
+                for k in range(15):
                     for n in range(4):
                         x[GREY[k] + n, p] -= np.float32(2)
+                for k in range(5):
+                    x[AROUND[k], p] -= np.float32(2)
             for k in range(CHANNELS):
                 for p in range(BLOCK):
                     out[0, k, i, start + p] = x[k, p]
@@ -133,9 +139,12 @@ def inputs(view: Image8, seen: Look, others: Alternatives, told: NDArray[np.floa
     rows, columns = seen.half.shape[1:]
     size = [-(-n // BLOCK) * BLOCK for n in (rows + 2 * _ROUND, columns)]
     out = np.empty((1, CHANNELS, *size), np.float32)
-    measured, near, far, farther = others.measured, others.near, others.far, others.farther
+    each = (others.measured, others.near, others.far, others.farther, others.swept)
+    measured, near, far, farther, swept = (other.agreement for other in each)
     maps = (measured.least, measured.most, near.least, far.least, near.most, far.most,
-            farther.least, farther.most, near.rho, far.rho, farther.rho)
+            farther.least, farther.most, measured.typical, near.typical, far.typical,
+            farther.typical, swept.least, swept.most, swept.typical,
+            *(other.rho for other in each[1:]), *(other.agreement.around for other in each))
     rows_in_parallel(_input_rows, size[0], view, seen.full, seen.half, maps, told, unit,
                      *_geometry(grid, baselines), grid.wrap // 2, out)
     return out
@@ -153,9 +162,9 @@ def _network() -> Convolutions:
 
 
 def judged(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """The network's outputs: float32 (12, *shape); three as of `reliability.percentiles`, the
+    """The network's outputs: float32 (13, *shape); three as of `reliability.percentiles`, the
     logarithm by which a parallax of its own is larger than the measured one, the same three of
-    what `likeliest` gives, and five by which that is chosen.
+    what `likeliest` gives, and six by which that is chosen.
 
     x : of `inputs`
     shape : of the polar grid
@@ -167,12 +176,12 @@ def judged(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32
 
 @fast_kernel
 def _likeliest_rows(first: int, last: int, told: NDArray[np.float32], unit: Map, measured: Map,
-                    near: Map, far: Map, farther: Map, pixel: Map, baselines: Map, out: Map,
-                    its_unit: Map) -> None:  # pragma: no cover - compiled
+                    near: Map, far: Map, farther: Map, swept: Map, pixel: Map, baselines: Map,
+                    out: Map, its_unit: Map) -> None:  # pragma: no cover - compiled
     for i in range(first, last):
         for j in range(out.shape[1]):
             best = 0
-            for k in range(1, 5):
+            for k in range(1, 6):
                 if told[7 + k, i, j] > told[7 + best, i, j]:
                     best = k
             if best == 0:
@@ -183,6 +192,8 @@ def _likeliest_rows(first: int, last: int, told: NDArray[np.float32], unit: Map,
                 rho = far[i, j]
             elif best == 3:
                 rho = farther[i, j]
+            elif best == 5:
+                rho = swept[i, j]
             else:
                 pixels = (ADDED + unit[i, j] * (baselines[0] / pixel[j])) * np.exp(
                     told[3, i, j]) - ADDED
@@ -194,12 +205,13 @@ def _likeliest_rows(first: int, last: int, told: NDArray[np.float32], unit: Map,
 def likeliest(told: NDArray[np.float32], unit: Map, others: Alternatives, grid: PolarGrid,
               baselines: Sequence[float]) -> tuple[Map, Map]:
     """The inverse range that is likeliest by what is round about, and its unit, 1/m: what was
-    measured, what lies nearest or farthest round about, or the network's own.
+    measured or swept, what lies nearest or farthest round about, or the network's own.
 
     told : of `judged`; unit : of `reliability.percentiles`; others : to what was measured
     """
     sine, scale = _geometry(grid, baselines)
     rho, its_unit = np.empty_like(unit), np.empty_like(unit)
     rows_in_parallel(_likeliest_rows, len(unit), told, unit, others.measured.rho, others.near.rho,
-                     others.far.rho, others.farther.rho, scale[0] / sine, scale[1:], rho, its_unit)
+                     others.far.rho, others.farther.rho, others.swept.rho, scale[0] / sine,
+                     scale[1:], rho, its_unit)
     return rho, its_unit
