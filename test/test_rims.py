@@ -103,7 +103,7 @@ def test_the_difference_is_the_mean_share_of_what_references_may_differ(fattened
 
     def difference(pairs: list) -> np.ndarray:
         compared = JointRefinement(view.image, view.grid, view.axes, pairs).compared(wide)
-        return compared.difference(wide, 1.3)
+        return compared.difference(wide, 2.0)
     one, two = (difference([pair]) for pair in view.pairs)
     noise = np.random.default_rng(0).integers(0, 255, view.pairs[0][0].shape, np.uint8)
     other = (noise, view.pairs[1][1])

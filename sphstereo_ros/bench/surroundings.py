@@ -49,10 +49,12 @@ from .accuracy import as_frame
 from .reliability import MOST, PERCENTILES, Watched, disturbed
 from .unet import Design, Parameters, fit_arguments, percentile_loss, save_fit
 
-_SEEDS, _PAIR_SEEDS, _SLOW_SEEDS, _HARD_SEEDS = (
-    range(11, 61), range(61, 81), range(82, 98), range(121, 141))
+_SEEDS, _PAIR_SEEDS, _SLOW_SEEDS, _HARD_SEEDS, _SMALL_SEEDS = (
+    range(11, 61), range(61, 81), range(82, 98), range(121, 141), range(141, 185))
 _SLOW = (0.05, 0.1, 0.07)  # m from frame to frame; odd and even seeds differ, as heights go by 3
 _HARD = ('repetition', 'wall', 'traffic', 'occlusion')
+_HEIGHTS = (160, 240, 320, 384, 480)  # of small ones
+_LIGHTS = (None, None, 'rolling_exposure', 'exposure', 'low_light', None)
 _RENDERED = (1, 7, 10, 11)  # frames of a sequence
 # Windows by how many frames a sequence has: current frame, and the references' places.
 _WINDOWS = {2: ((0, (1,)),), 4: ((3, (2, 1, 0)), (3, (2, 1)), (3, (2,))),
@@ -163,6 +165,18 @@ def _render_ways(folder: Path) -> None:
     for name, seed, step, nuisance in tqdm(jobs, unit='scene'):
         height = 960 if name != 'corridor' and seed % 3 else 480
         render_way(folder, name, seed, height, step, nuisance)
+    for seed in tqdm(_SMALL_SEEDS, unit='small scene'):
+        _render_small(folder, seed)
+
+
+def _render_small(folder: Path, seed: int) -> None:
+    """A way of few rows, as small computers and quick looks have them."""
+    name, height = ('street', 'takeoff', 'corridor', 'street')[seed % 4], _HEIGHTS[seed % 5]
+    if name == 'street':
+        spacing = float(np.random.default_rng(seed).choice([.28, .1, .4]))
+        render_way(folder, name, seed, height, spacing, _LIGHTS[seed % 6])
+    else:
+        render_way(folder, name, seed, height, None, None)
 
 
 def render_way(folder: Path, name: str, seed: int, height: int, spacing: float | None,

@@ -18,7 +18,7 @@ from .refinement import JointRefinement
 from .warp import Map
 
 _NEARER, _FARTHER = 15, (9, 15, 31)  # px: windows of what is round about
-_SPREAD = 1.3  # px, round which views are compared
+_SPREAD = 2.0  # px, round which views are compared
 _KEEP = 0.025  # of what views may differ, by which another range must look better
 # Neighbours of different ranges cost so much of it a unit, up to so many units (a share of the
 # range, or a pixel of the longest baseline); less where grey changes, to half at _EDGE levels.
