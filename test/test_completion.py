@@ -42,10 +42,10 @@ def judged_with(monkeypatch, likely: float, completed: float, nearer: float = 0.
     fits = np.where(np.arange(shape[0])[:, None] % 2, misfit, 1) + np.zeros(shape)
     refined = Refined(rho, np.full(shape, 1e9, np.float32), fits.astype(np.float32))
     monkeypatch.setattr(judgement, 'percentiles', lambda *_: (told(likely), rho))
-    own = np.arange(5)[:, None, None] == 4  # of what may be chosen, the network's own range
+    own = np.arange(6)[:, None, None] == 4  # of what may be chosen, the network's own range
     monkeypatch.setattr(judgement, 'judged', lambda *_: np.concatenate([
         told(likely), larger, told(completed, completed, nearer),
-        np.broadcast_to(own, (5, *shape)).astype(np.float32)]))
+        np.broadcast_to(own, (6, *shape)).astype(np.float32)]))
     judged = by_looks(Found(VIEW, *pictures, refined, rho, matched, parallax),
                       others_of(refined), GRID, BASELINES)
     assert (judged.rho == RHO)[1::2, SHIFT < 0.8].all()

@@ -172,6 +172,13 @@ def test_the_likeliest_is_what_was_chosen(seed):
     assert (unit >= rho).all()
 
 
+def test_outputs_that_are_missing_are_an_error():
+    ranges = np.ones(GRID.shape, np.float32)
+    with pytest.raises(ValueError, match='12 outputs, not 13'):
+        likeliest(told_of(np.zeros(GRID.shape, int))[:12], ranges,
+                  others_of(Refined(ranges, ranges, ranges)), GRID, BASELINES)
+
+
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 1000))
 def test_what_is_round_about_may_refuse_but_not_believe_alone(seed):

@@ -208,7 +208,11 @@ def likeliest(told: NDArray[np.float32], unit: Map, others: Alternatives, grid: 
     measured or swept, what lies nearest or farthest round about, or the network's own.
 
     told : of `judged`; unit : of `reliability.percentiles`; others : to what was measured
+
+    Raises ValueError where other than those outputs are told: a kernel would read beyond them.
     """
+    if len(told) != _TOLD:
+        raise ValueError(f'{len(told)} outputs, not {_TOLD}')
     sine, scale = _geometry(grid, baselines)
     rho, its_unit = np.empty_like(unit), np.empty_like(unit)
     rows_in_parallel(_likeliest_rows, len(unit), told, unit, others.measured.rho, others.near.rho,
