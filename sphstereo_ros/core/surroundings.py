@@ -69,7 +69,7 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
         information += full[4, r, c] * unit * unit
         longest += pixels * scale[2]
         sines += s
-        for k in range(15):
+        for k in range(len(GREY)):
             x[GREY[k] + n, p] = np.float32(2) + others[k][r, c]
     x[4, p], x[9, p] = quarter * nearer, quarter * sign
     x[14, p] = np.float32(0.5) + half[12, h, w]
@@ -80,11 +80,11 @@ def _input(view: Image8, full: NDArray[np.float32], half: NDArray[np.float32],
     x[21, p] = np.float32(0.1) + quarter * longest
     x[22, p], x[23, p] = quarter * sines, high - low
     x[24, p] = np.float32(0.05) + half[13, h, w]
-    for k in range(4):
-        share = others[15 + k][2 * h, 2 * w] / units[2 * h, 2 * w]
+    for k in range(len(SHARES)):
+        share = others[len(GREY) + k][2 * h, 2 * w] / units[2 * h, 2 * w]
         x[SHARES[k], p] = ABOVE + min(max(share, -one), np.float32(20))
-    for k in range(5):
-        x[AROUND[k], p] = np.float32(2) + others[19 + k][h, w]
+    for k in range(len(AROUND)):
+        x[AROUND[k], p] = np.float32(2) + others[len(GREY) + len(SHARES) + k][h, w]
 
 
 @fast_kernel
@@ -112,10 +112,10 @@ def _input_rows(first: int, last: int, view: Image8, full: NDArray[np.float32],
                 x[20, p] *= np.float32(0.2)
                 x[21, p] *= np.float32(0.5)
                 x[24, p] += np.float32(1)
-                for k in range(15):
+                for k in range(len(GREY)):
                     for n in range(4):
                         x[GREY[k] + n, p] -= np.float32(2)
-                for k in range(5):
+                for k in range(len(AROUND)):
                     x[AROUND[k], p] -= np.float32(2)
             for k in range(CHANNELS):
                 for p in range(BLOCK):
