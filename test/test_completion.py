@@ -15,18 +15,25 @@ RHO = 0.5  # 1/m, measured
 GUESS = 0.4
 PIXEL = GRID.pixel / np.maximum(np.abs(np.sin(GRID.theta())), 0.02)  # rad across the motion
 THETA = GRID.theta()
-# px of parallax of what is completed, of the nearest reference
-SHIFT = (THETA - np.arctan2(np.sin(THETA), np.cos(THETA) + GUESS * BASELINES[0])) / GRID.pixel
+
+
+def shift(baseline: float) -> np.ndarray:
+    """px of parallax of what is completed, of a reference so far away."""
+    return (THETA - np.arctan2(np.sin(THETA), np.cos(THETA) + GUESS * baseline)) / GRID.pixel
+
+
+SHIFT = shift(BASELINES[0])
 SEEN = SHIFT > 1.1
 VIEW = np.full(GRID.shape, 100, np.uint8)
 
 
 def judged_with(monkeypatch, likely: float, completed: float, nearer: float = 0.01,
                 misfit: float = 1, pictures: tuple[Image8, Image8] = (VIEW, VIEW),
-                amid: float = 0.01, guess: float = GUESS) -> Judged:
+                amid: float = 0.01, guess: float = GUESS,
+                baselines: tuple[float, float] = BASELINES, seen: np.ndarray = SEEN) -> Judged:
     """Likely errors of what is measured and of what is completed, and by how much that may be
-    nearer, in units: what is judged of every second row. Of those amid, nothing is likelier than
-    what was measured, with a likely error of `amid`.
+    nearer, in units: what is judged of every second row, of the columns `seen`. Of those amid,
+    nothing is likelier than what was measured, with a likely error of `amid`.
     """
     shape = GRID.shape
     rho = np.full(shape, RHO, np.float32)
@@ -36,20 +43,21 @@ def judged_with(monkeypatch, likely: float, completed: float, nearer: float = 0.
         found = np.broadcast_to(logarithms[:, None, None], (3, *shape)).astype(np.float32)
         found[:, ::2] = np.log(amid + LEAST)
         return found
-    small, large = (np.log(0.1 + r * BASELINES[0] / PIXEL) for r in (RHO, guess))
-    larger = np.broadcast_to(large - small, (1, *shape)).astype(np.float32)
+    small, large = (np.log(0.1 + r * baselines[0] / PIXEL) for r in (RHO, guess))
+    larger = np.broadcast_to(large - small, (2, *shape)).astype(np.float32)
     _, _, _, matched, parallax = found(np.random.default_rng(0))
     fits = np.where(np.arange(shape[0])[:, None] % 2, misfit, 1) + np.zeros(shape)
     refined = Refined(rho, np.full(shape, 1e9, np.float32), fits.astype(np.float32))
     monkeypatch.setattr(judgement, 'percentiles', lambda *_: (told(likely), rho))
-    own = np.arange(6)[:, None, None] == 4  # of what may be chosen, the network's own range
+    own = np.arange(7)[:, None, None] == 4  # of what may be chosen, the network's own range
     monkeypatch.setattr(judgement, 'judged', lambda *_: np.concatenate([
         told(likely), larger, told(completed, completed, nearer),
-        np.broadcast_to(own, (6, *shape)).astype(np.float32)]))
+        np.broadcast_to(own, (7, *shape)).astype(np.float32)]))
     judged = by_looks(Found(VIEW, *pictures, refined, rho, matched, parallax),
-                      others_of(refined), GRID, BASELINES)
-    assert (judged.rho == RHO)[1::2, SHIFT < 0.8].all()
-    return Judged(*(m[1::2, SEEN] for m in (judged.rho, judged.other, judged.error,
+                      others_of(refined), GRID, baselines)
+    nowhere = (shift(baselines[0]) < 0.8) & (shift(baselines[1]) < 3)
+    assert (judged.rho == RHO)[1::2, nowhere].all()
+    return Judged(*(m[1::2, seen] for m in (judged.rho, judged.other, judged.error,
                                             judged.frames)))
 
 
@@ -82,11 +90,14 @@ def test_what_may_be_much_nearer_is_not_completed(monkeypatch):
     assert (judged.frames <= 0).all()
 
 
-@pytest.mark.parametrize(('differs', 'taken'), [
-    (3, True), (-3, True), (20, False), (-20, False)])
-def test_what_the_reference_contradicts_is_not_completed(monkeypatch, differs, taken):
+@pytest.mark.parametrize(('differs', 'nearer', 'taken'), [
+    (3, 0.01, True), (-3, 0.5, True), (12, 0.3, True), (-12, 0.5, False), (20, 0.01, False),
+    (-20, 0.01, False)])
+def test_what_the_reference_contradicts_is_not_completed(monkeypatch, differs, nearer, taken):
+    """Less of a contradiction is enough where something may be nearer."""
     there = np.full_like(VIEW, 100 + differs)
-    judged = judged_with(monkeypatch, 0.9, 0.02, pictures=(VIEW, there))
+    judged = judged_with(monkeypatch, 0.9, 0.02, nearer, pictures=(VIEW, there),
+                         seen=SEEN & (shift(BASELINES[1]) > 4.5))
     assert (judged.frames == (1 if taken else 0)).all()
 
 
@@ -99,7 +110,7 @@ def test_the_reference_is_asked_where_it_would_be_seen(monkeypatch):
                    for r in (3 * column, np.interp(column, at[sphere], 3 * column[sphere])))
     inside = np.sin(THETA)[SEEN] > 0.95
     for there, taken in ((moved, 1), (ramp, 0)):
-        judged = judged_with(monkeypatch, 0.9, 0.02, pictures=(ramp, there))
+        judged = judged_with(monkeypatch, 0.9, 0.02, nearer=0.5, pictures=(ramp, there))
         assert (judged.frames[:, inside] == taken).all()
 
 
@@ -107,6 +118,17 @@ def test_what_the_nearest_reference_could_not_show_is_not_completed(monkeypatch)
     """With less than a pixel of parallax it shows the same whatever is there (see judged_with)."""
     assert 0 < SEEN.mean() < (SHIFT > 0.8).mean() < 1
     assert (judged_with(monkeypatch, 0.9, 0.02).frames == 1).all()
+
+
+@pytest.mark.parametrize(('nearer', 'taken'), [(0.01, True), (0.3, True), (0.5, False)])
+def test_it_is_enough_if_the_farthest_reference_shows_it_unless_it_may_be_near(
+        monkeypatch, nearer, taken):
+    baselines = (0.08, BASELINES[1])
+    shown = (shift(baselines[1]) > 4.5) & (np.sin(THETA) > 0.1)
+    assert shown.any()
+    assert (shift(baselines[0])[shown] < 0.8).all()
+    judged = judged_with(monkeypatch, 0.9, 0.02, nearer, baselines=baselines, seen=shown)
+    assert (judged.frames == (1 if taken else 0)).all()
 
 
 def test_where_nothing_is_known_round_about_nothing_is_completed(monkeypatch):

@@ -187,8 +187,8 @@ def test_what_is_told_decides_for_how_much_it_counts(monkeypatch, likely, nearer
     refined = Refined(rho, np.full(shape, 1e9, np.float32), np.full(shape, misfit, np.float32))
     monkeypatch.setattr(judgement, 'percentiles', lambda *_: (told(own), rho))
     monkeypatch.setattr(judgement, 'judged', lambda *_: np.concatenate([
-        told(likely), np.ones((1, *shape), np.float32), told(9),  # nothing is completed
-        np.zeros((6, *shape), np.float32)]))
+        told(likely), np.ones((2, *shape), np.float32), told(9),  # nothing is completed
+        np.zeros((7, *shape), np.float32)]))
     judged = by_looks(Found(view, view, view, refined, rho, matched, parallax),
                       others_of(refined), GRID, baselines)
     np.testing.assert_array_equal(judged.rho, rho)

@@ -96,7 +96,7 @@ def test_sizes_halve_evenly():
     out, seen, told, _ = seen_at(found(np.random.default_rng(3)))
     assert out.shape[2] % BLOCK == out.shape[3] % BLOCK == 0
     assert out.shape[2] >= seen.half.shape[1] + 2 * ROUND
-    assert judged(out, GRID.shape).shape == (13, *told.shape[1:])
+    assert judged(out, GRID.shape).shape == (15, *told.shape[1:])
 
 
 @settings(max_examples=8, deadline=None)
@@ -134,28 +134,32 @@ def test_a_view_that_is_turned_is_judged_as_before():
     np.testing.assert_allclose(np.roll(a, turn, 1)[:, 64:-64], b[:, 64:-64], atol=0.3)
 
 
-def told_of(choice: np.ndarray, larger: np.ndarray | float = 0.0) -> np.ndarray:
-    """What the network tells, if of six ranges it chooses that one."""
-    told = np.zeros((13, *GRID.shape), np.float32)
-    told[3] = larger
-    np.put_along_axis(told, 7 + choice[None], np.float32(1), 0)
+def told_of(choice: np.ndarray, *larger: np.ndarray) -> np.ndarray:
+    """What the network tells, if of seven ranges it chooses that one; its own, if any, are so much
+    larger.
+    """
+    told = np.zeros((15, *GRID.shape), np.float32)
+    told[3:5] = larger or 0
+    np.put_along_axis(told, 8 + choice[None], np.float32(1), 0)
     return told
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 1000), st.floats(0.01, 100))
-def test_the_networks_own_range_is_as_much_larger_as_told(seed, scale):
+def test_the_networks_own_ranges_are_as_much_larger_as_told(seed, scale):
     """The network tells by how much the logarithm of the shortest baseline's parallax, and a tenth
     of a pixel, is larger than where the unit was measured.
     """
     rng, baselines = np.random.default_rng(seed), [scale * b for b in BASELINES]
-    unit, true = (rng.uniform(0.01, 2, GRID.shape).astype(np.float32) / scale for _ in range(2))
+    unit, *true = (rng.uniform(0.01, 2, GRID.shape).astype(np.float32) / scale for _ in range(3))
     pixel = GRID.pixel / np.maximum(np.abs(np.sin(GRID.theta())), 0.02)
-    measured, wanted = (np.log(0.1 + m * min(baselines) / pixel) for m in (unit, true))
-    told = told_of(np.full(GRID.shape, 4), wanted - measured)
+    measured, *wanted = (np.log(0.1 + m * min(baselines) / pixel) for m in (unit, *true))
+    second = rng.integers(0, 2, GRID.shape) > 0
+    told = told_of(np.where(second, 6, 4), *(m - measured for m in wanted))
     others = others_of(Refined(unit, unit, unit))
     rho, its_unit = likeliest(told, unit, others, GRID, baselines)
-    np.testing.assert_allclose(rho, true, rtol=1e-3, atol=1e-4 / scale)
+    np.testing.assert_allclose(rho, np.where(second, true[1], true[0]), rtol=1e-3,
+                               atol=1e-4 / scale)
     np.testing.assert_allclose(its_unit, np.maximum(rho, pixel / max(baselines)), rtol=1e-5)
 
 
@@ -166,7 +170,7 @@ def test_the_likeliest_is_what_was_chosen(seed):
     ranges = rng.uniform(0.01, 2, (5, *GRID.shape)).astype(np.float32)
     others = Alternatives(*(Alternative(m, Agreement(m, m, m, m)) for m in ranges))
     choice = rng.integers(0, 5, GRID.shape)
-    told = told_of(np.where(choice < 4, choice, 5))  # the fifth is the network's own
+    told = told_of(np.where(choice < 4, choice, 5))  # the fifth and the last are its own
     rho, unit = likeliest(told, ranges[0], others, GRID, BASELINES)
     np.testing.assert_array_equal(rho, np.take_along_axis(ranges, choice[None], 0)[0])
     assert (unit >= rho).all()
@@ -174,8 +178,8 @@ def test_the_likeliest_is_what_was_chosen(seed):
 
 def test_outputs_that_are_missing_are_an_error():
     ranges = np.ones(GRID.shape, np.float32)
-    with pytest.raises(ValueError, match='12 outputs, not 13'):
-        likeliest(told_of(np.zeros(GRID.shape, int))[:12], ranges,
+    with pytest.raises(ValueError, match='14 outputs, not 15'):
+        likeliest(told_of(np.zeros(GRID.shape, int))[:14], ranges,
                   others_of(Refined(ranges, ranges, ranges)), GRID, BASELINES)
 
 
@@ -216,7 +220,7 @@ def test_sky_behind_leaves_is_refused(monkeypatch, references, least):
     assert known > least
     # A network that believes everything leaves the decision to what a pixel tells by itself.
     monkeypatch.setattr(judgement, 'judged', lambda x, shape: np.broadcast_to(
-        np.float32([-9, -9, -9, 0, 9, 9, 9, 9, 0, 0, 0, 0, 0])[:, None, None], (13, *shape)))
+        np.float32([-9] * 3 + [0] * 2 + [9] * 3 + [9] + [0] * 6)[:, None, None], (15, *shape)))
     alone, _ = believed()
     assert ghosts < 0.25 * alone
 

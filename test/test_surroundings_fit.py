@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sphstereo_ros.bench.surroundings import DESIGN, Patch, fit
+from sphstereo_ros.bench.surroundings import DESIGN, Patch, fit, loss
 from sphstereo_ros.bench.unet import plain
 from sphstereo_ros.core.surroundings import CHANNELS
 
@@ -58,12 +58,29 @@ def test_a_fit_tells_a_range_of_its_own():
     parts = fit([Patch(x.astype(np.float16), *maps, 1.0)], 320, rng)
     with torch.no_grad():
         out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
-    larger, likely = out[12:16].mean(0), np.exp(out[16:20].mean(0))
-    choice = out[28:52].reshape(6, 4, *out.shape[1:]).argmax(0)
-    assert (choice == 4).mean() > 0.9
-    assert np.median(np.abs(larger[:, 4:28] - 0.5)) < 0.1
-    assert np.median(np.abs(larger[:, 36:60] - 1.5)) < 0.1
+    larger, likely = out[12:20].reshape(2, 4, *out.shape[1:]), np.exp(out[20:24].mean(0))
+    choice = out[32:60].reshape(7, 4, *out.shape[1:]).argmax(0)
+    assert np.isin(choice, (4, 6)).mean() > 0.9
+    chosen = np.where(choice == 4, *larger).mean(0)
+    assert np.median(np.abs(chosen[:, 4:28] - 0.5)) < 0.1
+    assert np.median(np.abs(chosen[:, 36:60] - 1.5)) < 0.1
     assert np.median(likely) < 0.2
+
+
+@pytest.mark.parametrize('first', [0.5, 1.5])
+def test_of_its_own_ranges_the_better_one_counts(first):
+    """Where either of two may be, one for each costs less than twice what lies between."""
+    x = torch.zeros(1, CHANNELS, 8, 8)
+    true = torch.where(torch.arange(16) % 2 > 0, 0.5, 1.5).expand(1, 1, 16, 16)
+    zero, one = torch.zeros_like(true), torch.ones_like(true)
+
+    def costs(*own: float) -> float:
+        out = torch.zeros(1, len(DESIGN.begin), 8, 8)
+        for n, larger in enumerate(own):
+            out[:, 4 * (3 + n):4 * (4 + n)] = larger
+        return float(loss(out, x, zero, true, one, 1.0))
+    assert costs(first, 2 - first) < costs(1, 1) - 0.3
+    assert costs(first, 2 - first) < costs(first, first) - 0.3
 
 
 def test_a_fit_chooses():
@@ -77,9 +94,9 @@ def test_a_fit_chooses():
     parts = fit([Patch(x.astype(np.float16), *maps, 0.1)], 320, rng)
     with torch.no_grad():
         out = DESIGN.forward(parts, torch.from_numpy(x)[None]).numpy()[0]
-    choice = out[28:52].reshape(6, 4, *out.shape[1:]).argmax(0)
-    assert np.isin(choice[:, :, 4:28], (0, 4)).mean() > 0.9
-    assert np.isin(choice[:, :, 36:60], (2, 4)).mean() > 0.9
+    choice = out[32:60].reshape(7, 4, *out.shape[1:]).argmax(0)
+    assert np.isin(choice[:, :, 4:28], (0, 4, 6)).mean() > 0.9
+    assert np.isin(choice[:, :, 36:60], (2, 4, 6)).mean() > 0.9
 
 
 def test_nothing_is_fitted_to_what_is_not_known():

@@ -4,8 +4,8 @@
     python -m sphstereo_ros.bench.surroundings fit OUT.onnx FOLDER... [--patches DIR]
 
 `render` makes scenes for it alone: of seeds that are neither tuned on nor reported, four frames
-each, or one pair of two cameras. `fit` needs torch and onnx (extra `fit`); the package itself does
-without.
+each, or one pair of two cameras; and hollows. `fit` needs torch and onnx (extra `fit`); the
+package itself does without.
 """
 from __future__ import annotations
 
@@ -46,25 +46,29 @@ from sphstereo_ros.scenes.sequence import (
 )
 
 from .accuracy import as_frame
+from .hollows import hollow
 from .reliability import MOST, PERCENTILES, Watched, disturbed
 from .unet import Design, Parameters, fit_arguments, percentile_loss, save_fit
 
-_SEEDS, _PAIR_SEEDS, _SLOW_SEEDS, _HARD_SEEDS, _SMALL_SEEDS = (
-    range(11, 61), range(61, 81), range(82, 98), range(121, 141), range(141, 185))
+_SEEDS, _PAIR_SEEDS, _SLOW_SEEDS, _HARD_SEEDS, _SMALL_SEEDS, _HOLLOW_SEEDS = (
+    range(11, 61), range(61, 81), range(82, 98), range(121, 141), range(141, 185),
+    range(221, 341))
 _SLOW = (0.05, 0.1, 0.07)  # m from frame to frame; odd and even seeds differ, as heights go by 3
 _HARD = ('repetition', 'wall', 'traffic', 'occlusion')
 _HEIGHTS = (160, 240, 320, 384, 480)  # of small ones
 _LIGHTS = (None, None, 'rolling_exposure', 'exposure', 'low_light', None)
 _RENDERED = (1, 7, 10, 11)  # frames of a sequence
+_STEP = 0.28  # m from frame to frame, of hollows
 # Windows by how many frames a sequence has: current frame, and the references' places.
 _WINDOWS = {2: ((0, (1,)),), 4: ((3, (2, 1, 0)), (3, (2, 1)), (3, (2,))),
             12: ((11, (10, 7, 1)), (8, (7, 4)), (5, (4,))),
             14: ((11, (10, 7, 1)), (8, (7, 4)), (5, (4,)))}
 _TURNED = 4.0  # degrees about each axis at most, of a pair's top camera
-# Weights of what is 10 to 100 m away, and of what is near but was found far.
-_RARE, _TOO_FAR = 2.0, 2.0
-_WIDTHS = (32, 32, 48, 64, 64, 64)  # channels at half size, a quarter, …
-_LAST = 32
+# Weights of what is 10 to 100 m away, of what of it is over 30 m away, and of what is near but was
+# found far.
+_RARE, _RARER, _TOO_FAR = 2.0, 2.0, 2.0
+_WIDTHS = (64, 64, 64, 96, 96, 96)  # channels at half size, a quarter, …
+_LAST = 64
 _BEGIN = -2.3  # logarithm of the error that it starts from
 _ROWS, _COLUMNS, _BATCH, _RATE = 192, 256, 3, 1e-3
 _TRUE = 0.02  # share of a sample of which the truth has to be known
@@ -74,10 +78,14 @@ _LARGE, _OFTEN = 600, 0.5  # rows at half size of a patch that is drawn so often
 # farther than the truth by more than such a logarithm; and how much all that counts.
 _WRONG, _FARTHER, _WORSE, _CHOICE = 0.5, 0.35, 0.3, 4.0
 
-_OF_ERROR, _CHOSEN = len(PERCENTILES), 2 + len(SHARES)
-_OWN, _LIKELIEST, _CHOICES = _OF_ERROR, _OF_ERROR + 1, 2 * _OF_ERROR + 1  # outputs
+# Of the network's own two, that which errs more counts so much.
+_OTHER = 0.05
+
+_OF_ERROR, _OWNS, _CHOSEN = len(PERCENTILES), 2, 3 + len(SHARES)
+_OWN, _LIKELIEST, _CHOICES = _OF_ERROR, _OF_ERROR + _OWNS, 2 * _OF_ERROR + _OWNS  # outputs
 DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
-                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * 4 + [_BEGIN] * (4 * _OF_ERROR)
+                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * 4 + [-0.3] * 4
+                + [_BEGIN] * (4 * _OF_ERROR)
                 + [2.0] * 4 + [0.0] * (4 * (_CHOSEN - 1)), deep=True)
 
 
@@ -119,8 +127,9 @@ class _Kept(Watched):
         error = (true - rho) / unit
         sine = np.maximum(np.sin(grid.theta()), 0.02)[None]
         weight = np.isfinite(error) * sine
-        rare, near = (true > 0.01 * self.unit) & (true < 0.1 * self.unit), true > 0.1 * self.unit
-        weight *= np.where(rare, _RARE, 1)
+        near, middle, known = (true > share * self.unit for share in (0.1, 1 / 30, 0.01))
+        weight *= np.where(known & ~near, _RARE, 1)
+        weight *= np.where(known & ~middle, _RARER, 1)
         weight *= np.where(near & (rho < true / 1.5), _TOO_FAR, 1)
         pixels = np.nan_to_num(true) * sine * min(baselines) / grid.pixel
         self.patch = Patch(x[0].astype(np.float16),
@@ -148,6 +157,9 @@ def render(folder: Path) -> None:
     """The scenes that the network is fitted to, beside those of the tuning seeds."""
     _render_ways(folder)
     _render_pairs(folder)
+    for seed in tqdm(_HOLLOW_SEEDS, unit='hollow'):
+        if not (target := folder / f'hollow_{seed}').exists():
+            _save(hollow(seed, _RENDERED, _STEP), target, 'hollow')
 
 
 def _render_ways(folder: Path) -> None:
@@ -186,7 +198,10 @@ def render_way(folder: Path, name: str, seed: int, height: int, spacing: float |
     if target.exists():
         return
     sequence = render_sequence(name, seed, 14, height, spacing=spacing, nuisance=nuisance)
-    frames: list[TruthFrame] = [sequence[k] for k in _RENDERED]
+    _save([sequence[k] for k in _RENDERED], target, name)
+
+
+def _save(frames: list[TruthFrame], target: Path, name: str) -> None:
     save_sequence(frames, target.with_suffix('.part'), name)
     target.with_suffix('.part').rename(target)
 
@@ -208,11 +223,11 @@ def _render_pairs(folder: Path) -> None:
 
 
 def candidates(x: Any, error: Any, true: Any, own: Any) -> tuple[Any, Any]:
-    """Parallaxes (N, 6, …), px of the shortest baseline, of what may be chosen: what was measured,
-    nearest, farthest, and farthest more widely round about, the network's own, and what was swept;
-    and the true.
+    """Parallaxes (N, 7, …), px of the shortest baseline, of what may be chosen: what was measured,
+    nearest, farthest, and farthest more widely round about, the network's first own, what was
+    swept, and its second; and the true.
 
-    own : logarithm of the network's own, and ADDED
+    own : (N, 2, …) logarithms of the network's own, and ADDED
     """
     import torch
     from torch.nn import functional
@@ -224,13 +239,17 @@ def candidates(x: Any, error: Any, true: Any, own: Any) -> tuple[Any, Any]:
     shares = [torch.exp(x[:, k:k + 1]) - float(ABOVE) for k in SHARES]
     round_about = [larger(share) * larger(unit[:, :, ::2, ::2]) for share in shares]
     *near_by, swept = round_about
-    return torch.cat([pixels - error * unit, *near_by, torch.exp(own) - float(ADDED), swept],
+    owns = torch.exp(own) - float(ADDED)
+    return torch.cat([pixels - error * unit, *near_by, owns[:, :1], swept, owns[:, 1:]],
                      1), pixels
 
 
 def loss(out: Any, x: Any, error: Any, true: Any, weight: Any, ratio: float) -> Any:
     """Of the percentiles of each pixel, of what was measured and of what is likeliest, of the
-    network's own range, and of the choice.
+    network's own ranges, and of the choice.
+
+    Of its own, the one that is less wrong counts: so at a rim, where either side may be, one comes
+    to tell each (as in multiple choice learning, Guzmán-Rivera et al. 2012).
     """
     import torch
     from torch.nn import functional
@@ -246,7 +265,8 @@ def loss(out: Any, x: Any, error: Any, true: Any, weight: Any, ratio: float) -> 
 
     def of(percentiles: Any, error: Any) -> Any:
         return percentile_loss(percentiles, error, weight, LEAST, MOST, PERCENTILES)
-    apart = (true - own).abs() + _CHOICE * chosen
+    owns = (true - own).abs()
+    apart = owns.amin(1, keepdim=True) + _OTHER * owns.amax(1, keepdim=True) + _CHOICE * chosen
     return (of(told[:, :_OF_ERROR], error) + of(told[:, _LIKELIEST:_CHOICES], off)
             + (weight * apart).sum() / weight.sum())
 

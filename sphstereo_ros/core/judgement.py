@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from .alternatives import Alternatives
 from .frames import Image8
 from .jit import fast_kernel, rows_in_parallel
-from .match_judge import likely_error, shows_the_same
+from .match_judge import CONTRADICTS, likely_error, shows_the_same
 from .matching import Parallax
 from .refinement import Refined
 from .reliability import NEAR_BY, expected_error, look, may_be_near, network, percentiles
@@ -35,6 +35,9 @@ _TAIL = 0.75  # of what is published
 # fewer px of parallax: it shows the same then whatever is there; nor where less than such a share
 # of what is round about (of the grid's height) is sure.
 _SURE_COMPLETED, _DIFFERS, _SHOWS = 0.3, 0.03, 1.0
+# Where nothing may be nearer by more units than that, the nearest reference may differ by so many
+# grey levels, and it is enough that the farthest has so many px of parallax.
+_PLAINLY, _CONTRADICTS, _SHOWS_FARTHEST = 0.4, 15.0, 4.0
 _AMID, _ROUND = 0.15, 1 / 15
 # Opinions are the same within a share of the inverse range, or so many pixels at the sweep's size;
 # and refinement may move what was matched by so many pixels.
@@ -98,9 +101,9 @@ def by_looks(found: Found, others: Alternatives, grid: PolarGrid,
     frames = np.where(near < np.float32(_VEILED), frames, np.int8(-1))
     rho = found.refined.rho.copy()
     guess = likeliest(wider, unit, others, grid, baselines)
-    scale = np.array([grid.pixel, min(baselines), np.exp(-_TAIL)], np.float32)
+    scale = np.array([grid.pixel, min(baselines), max(baselines), np.exp(-_TAIL)], np.float32)
     theta = grid.theta().astype(np.float32)
-    rows_in_parallel(_complete_rows, len(rho), found.now, found.before, wider[4:7], *guess,
+    rows_in_parallel(_complete_rows, len(rho), found.now, found.before, wider[5:8], *guess,
                      _share_round(sure, grid), theta, scale, rho, error, frames)
     return Judged(rho, found.other, error, frames)
 
@@ -114,6 +117,14 @@ def _share_round(sure: NDArray[np.bool_], grid: PolarGrid) -> Map:
 
 
 @fast_kernel
+def _parallax(theta: np.float32, rho: np.float32, baseline: np.float32,
+              pixel: np.float32) -> np.float32:  # pragma: no cover - compiled
+    """px by which a reference so far away sees something elsewhere along the meridian."""
+    moved = _arctan2(np.sin(theta), np.cos(theta) + rho * baseline)
+    return np.float32((theta - moved) / pixel)
+
+
+@fast_kernel
 def _complete_rows(first: int, last: int, view: Image8, before: Image8,
                    told: NDArray[np.float32], guess: Map, unit: Map, amid: Map, theta: Map,
                    scale: Map, rho: Map, error: Map,
@@ -121,11 +132,12 @@ def _complete_rows(first: int, last: int, view: Image8, before: Image8,
     """What was measured (rho, error, frames) becomes what is completed, where that is likelier.
 
     told, guess, unit : of `judged` and `likeliest`; amid : share of what is sure round about
-    scale : rad of a pixel, shortest baseline, share of the 95th percentile that is likely
+    scale : rad of a pixel, shortest and longest baseline, share of the 95th percentile that is
+    likely
     """
     for i in range(first, last):
         for j in range(rho.shape[1]):
-            likely = likely_error(told, 0, i, j, scale[2])
+            likely = likely_error(told, 0, i, j, scale[3])
             if likely > np.float32(_SURE_COMPLETED) or amid[i, j] < np.float32(_AMID):
                 continue
             nearer, there = np.exp(told[2, i, j]), guess[i, j]
@@ -136,9 +148,11 @@ def _complete_rows(first: int, last: int, view: Image8, before: Image8,
             if nearer > np.float32(_NEARER) and (
                     (there + nearer * unit[i, j]) * np.float32(NEAR_BY) * scale[1] > 1):
                 continue
-            moved = _arctan2(np.sin(theta[j]), np.cos(theta[j]) + there * scale[1])
-            pixels = (theta[j] - moved) / scale[0]
-            if pixels < np.float32(_SHOWS) or not shows_the_same(view, before, i, j, pixels):
+            plainly = nearer < np.float32(_PLAINLY) and _parallax(
+                theta[j], there, scale[2], scale[0]) >= np.float32(_SHOWS_FARTHEST)
+            pixels = _parallax(theta[j], there, scale[1], scale[0])
+            if not (plainly or pixels >= np.float32(_SHOWS)) or not shows_the_same(
+                    view, before, i, j, pixels, _CONTRADICTS if plainly else CONTRADICTS):
                 continue
             rho[i, j], error[i, j], frames[i, j] = there, spread, np.int8(1)
 

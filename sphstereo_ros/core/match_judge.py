@@ -31,7 +31,7 @@ _LOGARITHMS = (0, 1, 2, 3, 12, 13, 14, 15, 16, 17)  # of the inputs
 # Of the unit: a likely error with which a match stands, and what may be nearer with which not.
 _SURE, _NEARER = 0.25, 0.25
 _NEAR = 1 / 40  # rad at right angles to the motion: nearer than that matters (40 baselines)
-_CONTRADICTS = 6.0  # grey levels by which the reference differs from what was completed
+CONTRADICTS = 6.0  # grey levels by which the reference differs from what was completed
 TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
 
 
@@ -180,16 +180,16 @@ def _stands(pixels: np.float32, likely: np.float32, nearer: np.float32,
 
 
 @fast_kernel
-def shows_the_same(current: Image8, reference: Image8, r: int, c: int,
-                    pixels: np.float32) -> bool:  # pragma: no cover - compiled
-    """Whether the reference does not contradict such a parallax."""
+def shows_the_same(current: Image8, reference: Image8, r: int, c: int, pixels: np.float32,
+                   most: float = CONTRADICTS) -> bool:  # pragma: no cover - compiled
+    """Whether the reference differs by so many grey levels at most, if that is the parallax."""
     end = np.float32(current.shape[1] - 1.001)
     at = min(max(np.float32(c) - pixels, np.float32(0)), end)
     left = np.int32(at)
     share = at - np.float32(left)
     there = (np.float32(reference[r, left]) * (np.float32(1) - share)
              + np.float32(reference[r, left + 1]) * share)
-    return bool(abs(np.float32(current[r, c]) - there) <= np.float32(_CONTRADICTS))
+    return bool(abs(np.float32(current[r, c]) - there) <= np.float32(most))
 
 
 @fast_kernel

@@ -24,7 +24,7 @@ from .reliability import TAIL, Look, _geometry, logarithms
 from .warp import Map, PolarGrid
 
 CHANNELS = 94
-_TOLD = 13  # outputs for each pixel
+_TOLD = 15  # outputs for each pixel
 BLOCK = 32  # px at half size: what the network halves five times
 _ROUND = 64  # px at half size that it sees beyond the seam
 ADDED = np.float32(0.1)  # px of the shortest baseline, before a parallax's logarithm is taken
@@ -162,9 +162,9 @@ def _network() -> Convolutions:
 
 
 def judged(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """The network's outputs: float32 (13, *shape); three as of `reliability.percentiles`, the
-    logarithm by which a parallax of its own is larger than the measured one, the same three of
-    what `likeliest` gives, and six by which that is chosen.
+    """The network's outputs: float32 (15, *shape); three as of `reliability.percentiles`, the
+    logarithms by which two parallaxes of its own are larger than the measured one, the same three
+    of what `likeliest` gives, and seven by which that is chosen.
 
     x : of `inputs`
     shape : of the polar grid
@@ -175,14 +175,21 @@ def judged(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32
 
 
 @fast_kernel
+def _own(told: np.float32, unit: np.float32,
+         pixel: np.float32) -> np.float32:  # pragma: no cover - compiled
+    """Inverse range of a parallax of the network's own; pixel : inverse range of a px of it."""
+    return np.float32(max((ADDED + unit / pixel) * np.exp(told) - ADDED, _LEAST) * pixel)
+
+
+@fast_kernel
 def _likeliest_rows(first: int, last: int, told: NDArray[np.float32], unit: Map, measured: Map,
                     near: Map, far: Map, farther: Map, swept: Map, pixel: Map, baselines: Map,
                     out: Map, its_unit: Map) -> None:  # pragma: no cover - compiled
     for i in range(first, last):
         for j in range(out.shape[1]):
             best = 0
-            for k in range(1, 6):
-                if told[7 + k, i, j] > told[7 + best, i, j]:
+            for k in range(1, 7):
+                if told[8 + k, i, j] > told[8 + best, i, j]:
                     best = k
             if best == 0:
                 rho = measured[i, j]
@@ -195,9 +202,8 @@ def _likeliest_rows(first: int, last: int, told: NDArray[np.float32], unit: Map,
             elif best == 5:
                 rho = swept[i, j]
             else:
-                pixels = (ADDED + unit[i, j] * (baselines[0] / pixel[j])) * np.exp(
-                    told[3, i, j]) - ADDED
-                rho = max(pixels, _LEAST) * (pixel[j] / baselines[0])
+                own = told[3, i, j] if best == 4 else told[4, i, j]
+                rho = _own(own, unit[i, j], pixel[j] / baselines[0])
             out[i, j] = rho
             its_unit[i, j] = max(rho, pixel[j] / baselines[1])
 
@@ -205,7 +211,7 @@ def _likeliest_rows(first: int, last: int, told: NDArray[np.float32], unit: Map,
 def likeliest(told: NDArray[np.float32], unit: Map, others: Alternatives, grid: PolarGrid,
               baselines: Sequence[float]) -> tuple[Map, Map]:
     """The inverse range that is likeliest by what is round about, and its unit, 1/m: what was
-    measured or swept, what lies nearest or farthest round about, or the network's own.
+    measured or swept, what lies nearest or farthest round about, or one of the network's own.
 
     told : of `judged`; unit : of `reliability.percentiles`; others : to what was measured
 
