@@ -6,6 +6,7 @@ and gaps. An ellipsoid round the camera, near or far, under a texture of random 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -38,30 +39,37 @@ def hollow(seed: int, frames: Sequence[int], step: float) -> list[TruthFrame]:
     turn, way = exp(rng.normal(0, 1, 3)), exp(rng.normal(0, 1, 3))[:, 2]
     room = radius - step * (frames[-1] - frames[0])
     middle = min(_OFF * radius, 0.9 * room) * exp(rng.normal(0, 1, 3))[:, 0]
-    texture = _Waves(rng, radius, height)
+    around, texture = _Ellipsoid(axes, turn, middle), _Waves(rng, radius, height)
     noise = float(rng.uniform(*_NOISE))
     found = []
     for index in frames:
         position = step * (index - frames[-1]) * way
         rotation = exp(rng.normal(0, _SHAKE, 3))
-
-        def seen(rows: int, position: Floats = position, rotation: Floats = rotation,
-                 ) -> tuple[Floats, Floats]:
-            rays = Equirectangular(rows, 2 * rows).bearings() @ rotation.T
-            return _distance((position - middle) @ turn / axes, rays @ turn / axes), rays
-        distance, rays = seen(2 * height)
-        grey = texture(position + distance[..., None] * rays).astype(np.float32)
-        grey = cv2.resize(grey, (2 * height, height), interpolation=cv2.INTER_AREA)
+        fine, rays = (Equirectangular(n, 2 * n).bearings() @ rotation.T for n in (
+            2 * height, height))
+        points = position + around.range(position, fine)[..., None] * fine
+        grey = cv2.resize(texture(points).astype(np.float32), (2 * height, height),
+                          interpolation=cv2.INTER_AREA)
         image = np.clip(np.rint(grey + rng.normal(0, noise, grey.shape)), 0, 255).astype(np.uint8)
         found.append(TruthFrame(stamp_of(index), np.repeat(image[..., None], 3, 2),
-                                seen(height)[0], rotation, position))
+                                around.range(position, rays), rotation, position))
     return found
 
 
-def _distance(origin: Floats, rays: Floats) -> Floats:
-    """How far each ray (…, 3) goes from `origin` inside the unit sphere, in its own lengths."""
-    square, along = (rays**2).sum(-1), rays @ origin
-    return np.asarray((np.sqrt(along**2 + square * (1 - origin @ origin)) - along) / square)
+@dataclass(frozen=True)
+class _Ellipsoid:
+    """Its half axes (3,), m; their directions, the columns of (3, 3); and its middle (3,), m."""
+
+    axes: Floats
+    turn: Floats
+    middle: Floats
+
+    def range(self, position: Floats, rays: Floats) -> Floats:
+        """Distance, m, from `position` inside along each unit ray (…, 3)."""
+        origin = (position - self.middle) @ self.turn / self.axes
+        rays = rays @ self.turn / self.axes
+        square, along = (rays**2).sum(-1), rays @ origin
+        return np.asarray((np.sqrt(along**2 + square * (1 - origin @ origin)) - along) / square)
 
 
 class _Waves:
