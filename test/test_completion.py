@@ -55,7 +55,7 @@ def judged_with(monkeypatch, likely: float, completed: float, nearer: float = 0.
         np.broadcast_to(own, (7, *shape)).astype(np.float32)]))
     judged = by_looks(Found(VIEW, *pictures, refined, rho, matched, parallax),
                       others_of(refined), GRID, baselines)
-    nowhere = (shift(baselines[0]) < 0.8) & (shift(baselines[1]) < 3)
+    nowhere = (shift(baselines[0]) < 0.8) & ((nearer > 0.4) | (shift(baselines[1]) < 3))
     assert (judged.rho == RHO)[1::2, nowhere].all()
     return Judged(*(m[1::2, seen] for m in (judged.rho, judged.other, judged.error,
                                             judged.frames)))

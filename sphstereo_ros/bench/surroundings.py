@@ -70,6 +70,7 @@ _RARE, _RARER, _TOO_FAR = 2.0, 2.0, 2.0
 _WIDTHS = (64, 64, 64, 96, 96, 96)  # channels at half size, a quarter, …
 _LAST = 64
 _BEGIN = -2.3  # logarithm of the error that it starts from
+_APART = -0.3  # logarithm by which the second of its own ranges starts from another than the first
 _ROWS, _COLUMNS, _BATCH, _RATE = 192, 256, 3, 1e-3
 _TRUE = 0.02  # share of a sample of which the truth has to be known
 _LARGE, _OFTEN = 600, 0.5  # rows at half size of a patch that is drawn so often at least
@@ -78,15 +79,14 @@ _LARGE, _OFTEN = 600, 0.5  # rows at half size of a patch that is drawn so often
 # farther than the truth by more than such a logarithm; and how much all that counts.
 _WRONG, _FARTHER, _WORSE, _CHOICE = 0.5, 0.35, 0.3, 4.0
 
-# Of the network's own two, that which errs more counts so much.
-_OTHER = 0.05
+_OTHER = 0.05  # of the network's own two, that which errs more counts so much
 
 _OF_ERROR, _OWNS, _CHOSEN = len(PERCENTILES), 2, 3 + len(SHARES)
 _OWN, _LIKELIEST, _CHOICES = _OF_ERROR, _OF_ERROR + _OWNS, 2 * _OF_ERROR + _OWNS  # outputs
 DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
-                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * 4 + [-0.3] * 4
-                + [_BEGIN] * (4 * _OF_ERROR)
-                + [2.0] * 4 + [0.0] * (4 * (_CHOSEN - 1)), deep=True)
+                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * 4 + [_APART] * 4
+                + [_BEGIN] * (4 * _OF_ERROR) + [2.0] * 4 + [0.0] * (4 * (_CHOSEN - 1)),
+                deep=True)
 
 
 @dataclass(frozen=True)
