@@ -125,7 +125,7 @@ def test_intervals_and_baselines_replace_each_other_at_run_time(make_node: Any) 
     node = make_node('baseline.length:=0.3', 'pairing.intervals:=[4]')
     parameters = NodeParameters(node, names_of('frame_pairing'))
     assert 'not both' in changes(node, pairing__baselines=[1.0]).reason
-    assert changes(node, pairing__intervals=[1, 4, 10]).successful
+    assert changes(node, pairing__intervals=[1, 4, 7, 10]).successful
     assert changes(node, pairing__baselines=[1.0]).successful
     assert parameters.config.pairing.baselines == (1.0,)
     assert 'not both' in changes(node, pairing__intervals=[2]).reason
@@ -240,8 +240,8 @@ def test_help_and_stray_words(ros: Graph) -> None:
 def test_documentation_table_has_every_parameter() -> None:
     table = documentation_table().splitlines()
     assert len(table) == len(PARAMETERS) + 2
-    assert ('| `pairing.intervals` | int[] | [1, 4, 10] |  | 1 … 100 | yes | references, frames '
-            'back |') in table
+    assert ('| `pairing.intervals` | int[] | [1, 4, 7, 10] |  | 1 … 100 | yes | references, '
+            'frames back |') in table
     assert {row.count('|') for row in table} == {8}
 
 

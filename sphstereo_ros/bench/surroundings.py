@@ -3,7 +3,7 @@
     python -m sphstereo_ros.bench.surroundings render FOLDER
     python -m sphstereo_ros.bench.surroundings fit OUT.onnx FOLDER... [--patches DIR]
 
-`render` makes scenes for it alone: of seeds that are neither tuned on nor reported, four frames
+`render` makes scenes for it alone: of seeds that are neither tuned on nor reported, five frames
 each, or one pair of two cameras; and hollows. `fit` needs torch and onnx (extra `fit`); the
 package itself does without.
 """
@@ -57,12 +57,12 @@ _SLOW = (0.05, 0.1, 0.07)  # m from frame to frame; odd and even seeds differ, a
 _HARD = ('repetition', 'wall', 'traffic', 'occlusion')
 _HEIGHTS = (160, 240, 320, 384, 480)  # of small ones
 _LIGHTS = (None, None, 'rolling_exposure', 'exposure', 'low_light', None)
-_RENDERED = (1, 7, 10, 11)  # frames of a sequence
+_RENDERED = (1, 4, 7, 10, 11)  # frames of a sequence
 _STEP = 0.28  # m from frame to frame, of hollows
 # Windows by how many frames a sequence has: current frame, and the references' places.
-_WINDOWS = {2: ((0, (1,)),), 4: ((3, (2, 1, 0)), (3, (2, 1)), (3, (2,))),
-            12: ((11, (10, 7, 1)), (8, (7, 4)), (5, (4,))),
-            14: ((11, (10, 7, 1)), (8, (7, 4)), (5, (4,)))}
+_WINDOWS = {2: ((0, (1,)),),
+            5: ((4, (3, 2, 1, 0)), (4, (3, 2, 1)), (4, (3, 2)), (4, (3,))),
+            14: ((11, (10, 7, 4, 1)), (11, (10, 7, 4)), (8, (7, 4)), (5, (4,)))}
 _TURNED = 4.0  # degrees about each axis at most, of a pair's top camera
 # Weights of what is 10 to 100 m away, of what of it is over 30 m away, and of what is near but was
 # found far.
@@ -193,7 +193,7 @@ def _render_small(folder: Path, seed: int) -> None:
 
 def render_way(folder: Path, name: str, seed: int, height: int, spacing: float | None,
                nuisance: str | None) -> None:
-    """Four frames of a way, in a folder of their own, unless they are there."""
+    """Five frames of a way, in a folder of their own, unless they are there."""
     target = folder / f'{name}_{seed}'
     if target.exists():
         return

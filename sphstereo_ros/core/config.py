@@ -131,7 +131,7 @@ class PairingConfig:
                         'other continues as monocular', runtime=False)
     motion: bool = _p('pairing.motion', True, 'binocular: earlier frames of the bottom camera are '
                       'references, too, where it moved')
-    intervals: tuple[int, ...] = _p('pairing.intervals', (1, 4, 10),
+    intervals: tuple[int, ...] = _p('pairing.intervals', (1, 4, 7, 10),
                                     'references, frames back', low=1, high=100)
     baselines: tuple[float, ...] = _p('pairing.baselines', (0.0,), 'references by distance '
                                       'instead of pairing.intervals; 0 = unused', unit='m',
