@@ -90,7 +90,7 @@ def test_four_processes_give_what_the_core_gives(ros: Graph) -> None:
             client.stamped('points', frame.key.stamp)
     expected = truth('odometry', count=FULL)
     assert sorted(expected) == [f.key.stamp for f in frames(FULL)[1:]]
-    assert len(expected[frames(FULL)[-1].key.stamp].aligned.references) == 3
+    assert len(expected[frames(FULL)[-1].key.stamp].aligned.references) == 4
     for stamp, result in expected.items():
         depth, sigma = client.stamped('depth/image', stamp), client.stamped('depth/sigma', stamp)
         assert (depth.header.frame_id, sigma.header.frame_id) == ('camera_optical',) * 2
