@@ -60,9 +60,11 @@ _LIGHTS = (None, None, 'rolling_exposure', 'exposure', 'low_light', None)
 _RENDERED = (1, 4, 7, 10, 11)  # frames of a sequence
 _STEP = 0.28  # m from frame to frame, of hollows
 # Windows by how many frames a sequence has: current frame, and the references' places.
+_LONG = ((11, (10, 7, 4, 1)), (11, (10, 7, 4)), (8, (7, 4)), (5, (4,)))
 _WINDOWS = {2: ((0, (1,)),),
+            4: ((3, (2, 1, 0)), (3, (2, 1)), (3, (2,))),  # rendered without the fourth frame
             5: ((4, (3, 2, 1, 0)), (4, (3, 2, 1)), (4, (3, 2)), (4, (3,))),
-            14: ((11, (10, 7, 4, 1)), (11, (10, 7, 4)), (8, (7, 4)), (5, (4,)))}
+            12: _LONG, 14: _LONG}
 _TURNED = 4.0  # degrees about each axis at most, of a pair's top camera
 # Weights of what is 10 to 100 m away, of what of it is over 30 m away, and of what is near but was
 # found far.
