@@ -56,10 +56,12 @@ class Samples:
 
 
 def true_on_grid(truth: TruthFrame, grid: PolarGrid, axes: NDArray[np.float64],
-                 rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Floats:
+                 rows: NDArray[np.int64], columns: NDArray[np.int64], *,
+                 moving: bool = False) -> Floats:
     """True inverse range (N,), 1/m, of pixels of a polar grid; NaN where it is unknown or moves.
 
     axes : (3, 3) of the grid, optical frame of `truth`
+    moving : what moves has its range, too
     """
     theta, azimuth = grid.theta()[columns], grid.azimuth()[rows]
     sine = np.sin(theta)
@@ -69,7 +71,7 @@ def true_on_grid(truth: TruthFrame, grid: PolarGrid, axes: NDArray[np.float64],
                 height - 1)
     u = ((np.arctan2(x, z) / (2 * np.pi) + 0.5) * width).astype(np.intp) % width
     true = (1 / np.maximum(truth.range, 1e-3)).astype(np.float32)
-    if truth.moving is not None:
+    if truth.moving is not None and not moving:
         true[truth.moving] = np.nan
     return np.asarray(true[v, u])
 
@@ -99,9 +101,9 @@ class Watched(JointMatcher):
         return Judged(found.refined.rho, found.other, nothing, nothing.astype(np.int8))
 
     def true(self, grid: PolarGrid, axes: NDArray[np.float64], rows: NDArray[np.int64],
-             columns: NDArray[np.int64]) -> Floats:
-        """Inverse range, per `unit`; NaN where it is unknown or moves."""
-        return self.unit * true_on_grid(self._truth, grid, axes, rows, columns)
+             columns: NDArray[np.int64], *, moving: bool = False) -> Floats:
+        """Inverse range, per `unit`; NaN where it is unknown, or moves unless `moving`."""
+        return self.unit * true_on_grid(self._truth, grid, axes, rows, columns, moving=moving)
 
 
 class _Sampled(Watched):

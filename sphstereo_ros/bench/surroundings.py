@@ -50,9 +50,9 @@ from .hollows import hollow
 from .reliability import MOST, PERCENTILES, Watched, disturbed
 from .unet import Design, Parameters, fit_arguments, percentile_loss, save_fit
 
-_SEEDS, _PAIR_SEEDS, _SLOW_SEEDS, _HARD_SEEDS, _SMALL_SEEDS, _HOLLOW_SEEDS = (
+_SEEDS, _PAIR_SEEDS, _SLOW_SEEDS, _HARD_SEEDS, _SMALL_SEEDS, _HOLLOW_SEEDS, _HARDER_SEEDS = (
     range(11, 61), range(61, 81), range(82, 98), range(121, 141), range(141, 185),
-    range(221, 341))
+    range(221, 341), range(341, 373))
 _SLOW = (0.05, 0.1, 0.07)  # m from frame to frame; odd and even seeds differ, as heights go by 3
 _HARD = ('repetition', 'wall', 'traffic', 'occlusion')
 _HEIGHTS = (160, 240, 320, 384, 480)  # of small ones
@@ -97,8 +97,8 @@ class Patch:
 
     x : float16 (CHANNELS, rows, columns); error : float16 (2 rows, 2 columns), true less measured
     inverse range in units; true : the same shape, logarithm of the shortest baseline's parallax
-    and ADDED; weight : the same, 0 where the truth is unknown; ratio : of the shortest baseline to
-    the longest
+    and ADDED; weight : the same, 0 where the truth is unknown, or moves and is found too near;
+    ratio : of the shortest baseline to the longest
     """
 
     x: NDArray[np.float16]
@@ -124,8 +124,10 @@ class _Kept(Watched):
         told, unit = percentiles(seen, grid, baselines, network())
         x = interior(inputs(found.view, seen, self._others, told, unit, grid, baselines),
                      grid.shape)
-        true = self.true(grid, axes, *(n.ravel() for n in np.indices(grid.shape)))
-        true = true.reshape(grid.shape)
+        still, true = (self.true(grid, axes, *(n.ravel() for n in np.indices(grid.shape)),
+                                 moving=moving).reshape(grid.shape) for moving in (False, True))
+        # What moves seems near or far by its speed; only what then is dangerous is told.
+        true = np.where(true > rho, true, still)
         error = (true - rho) / unit
         sine = np.maximum(np.sin(grid.theta()), 0.02)[None]
         weight = np.isfinite(error) * sine
@@ -176,6 +178,8 @@ def _render_ways(folder: Path) -> None:
         jobs.append(('street', seed, _SLOW[(seed if seed % 2 else seed // 2) % 3], None))
     for seed in _HARD_SEEDS:
         jobs.append(('street', seed, None, _HARD[seed % 4]))
+    for seed in _HARDER_SEEDS:
+        jobs.append(('street', seed, None, ('wall', 'traffic')[seed % 2]))
     for name, seed, step, nuisance in tqdm(jobs, unit='scene'):
         height = 960 if name != 'corridor' and seed % 3 else 480
         render_way(folder, name, seed, height, step, nuisance)

@@ -4,6 +4,7 @@ Three signs: flow that leaves its meridian, though nothing at rest explains the 
 parallax below zero; and range under the floor, where nothing at rest can be (a vehicle that keeps
 pace has no parallax and seems to be infinitely far away). What moves along the course at a steady
 speed of its own shows none of the first two: it has the parallax of something nearer or farther.
+Where something is marked, the rest of its body is not believed either.
 """
 from __future__ import annotations
 
@@ -17,6 +18,7 @@ from .frames import Image8, RelativePose
 from .inverse_range import _grid_angles, _polar_row, pose_sigmas
 from .jit import kernel, rows_in_parallel
 from .matching import UNKNOWN, Parallax
+from .moving_bodies import unmarked_parts
 from .warp import Map, PolarGrid
 
 if TYPE_CHECKING:
@@ -206,8 +208,8 @@ def moving_parts(known: Remembered, measured: Measurement,
 
     Returns
     -------
-    bool (H, 2H), and uint8 (H, 2H), 255 = moves. The first has the second, and single pixels
-    that lie under the floor, too.
+    bool (H, 2H), and uint8 (H, 2H), 255 = moves. The first has the second, what may be an
+    unmarked part of it, and single pixels that lie under the floor, too.
 
     """
     height, width = known.rho.shape
@@ -221,5 +223,8 @@ def moving_parts(known: Remembered, measured: Measurement,
         under = (under_floor(measured.rho, measured.told, plane)
                  & under_floor(measured.other, measured.told, plane))
         signs = signs | cv2.resize(under, half, interpolation=cv2.INTER_NEAREST)
-    moving = cv2.resize(cleaned(signs), (width, height), interpolation=cv2.INTER_NEAREST)
-    return wrong | (moving != 0), np.asarray(moving, np.uint8)
+    moving = np.asarray(cv2.resize(cleaned(signs), (width, height),
+                                   interpolation=cv2.INTER_NEAREST), np.uint8)
+    if plane is not None:
+        wrong |= unmarked_parts(moving, known.rho, known.sigma, plane)
+    return wrong | (moving != 0), moving
