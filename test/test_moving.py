@@ -216,6 +216,25 @@ def test_a_speck_under_the_floor_is_wrong_but_does_not_move():
     assert not moving_parts(known, new, DOWN)[1].any()
 
 
+def test_the_roof_of_what_keeps_pace_is_not_told_as_the_house_behind():
+    rho, sigma, bearings = seen()
+    along = np.hypot(bearings[..., 0], bearings[..., 2])
+    rho = np.maximum(rho, along / 15).astype(np.float32)  # a house all around
+    sigma = np.float32(0.03) * rho
+    over_floor = 1.7 - 3 * bearings[..., 1] / along  # m, 3 m away
+    beside = np.abs(np.arctan2(bearings[..., 2], bearings[..., 0])) < 0.4
+    body, roof = (beside & (over_floor > low) & (over_floor < high)
+                  for low, high in ((0, 0.8), (0.8, 1.2)))
+    rho[body] = 0
+    known = Remembered(rho, sigma, np.ones_like(rho))
+    new = Measurement(rho, sigma, rho.copy(), np.ones(rho.shape, np.int8), sigma)
+    wrong, moving = moving_parts(known, new, DOWN)
+    assert (moving[body] == 255).mean() > 0.9
+    assert (moving[roof] == 255).mean() < 0.5
+    assert wrong[roof].mean() > 0.95
+    assert wrong[~beside].mean() < 0.02
+
+
 def test_specks_go_and_gaps_close_over_the_seam():
     mask = np.zeros((60, 120), np.uint8)
     mask[10, 20] = mask[30:32, 50:52] = 255

@@ -18,18 +18,20 @@ class Street:
     """A floor, a body `AWAY` m to the side over the azimuths `beside` (rad), a house behind.
 
     turn : (3, 3) optical frame ← x right, y down, z ahead over the floor
+    camera : its height over the floor, m
     """
 
-    def __init__(self, turn: np.ndarray = TURNS[0], azimuth: float = 0.0) -> None:
+    def __init__(self, turn: np.ndarray = TURNS[0], azimuth: float = 0.0,
+                 camera: float = CAMERA) -> None:
         level = Equirectangular(HEIGHT, 2 * HEIGHT).bearings() @ turn
-        self.plane = turn @ [0, 1 / CAMERA, 0]
+        self.plane = turn @ [0, 1 / camera, 0]
         self.beside = (np.arctan2(level[..., 0], level[..., 2]) - azimuth + np.pi
                        ) % (2 * np.pi) - np.pi
         along = np.hypot(level[..., 0], level[..., 2])
         down = level[..., 1]
-        self.tall = CAMERA - AWAY * down / along  # m over the floor, that far away
+        self.tall = camera - AWAY * down / along  # m over the floor, that far away
         self.at_body = along / AWAY
-        self.rho = np.maximum(along / HOUSE, down / CAMERA).astype(np.float32)
+        self.rho = np.maximum(along / HOUSE, down / camera).astype(np.float32)
 
     def part(self, low: float, high: float, left: float = -0.5,
              right: float = 0.5) -> np.ndarray:
@@ -60,6 +62,13 @@ def test_doors_without_a_mark_belong_to_it(azimuth, panes):
     taken = street.taken(street.part(0, 1.1, -0.5, -0.12) | street.part(0, 1.1, 0.12, 0.5)
                          | street.part(*panes))
     assert taken[street.part(0.9, 1.5, -0.45, 0.45)].all()
+
+
+def test_over_a_low_camera_a_body_may_be_as_tall_as_a_car():
+    street = Street(camera=0.5)
+    taken = street.taken(street.part(0, 0.35))
+    assert taken[street.part(0.35, 1.5, -0.45, 0.45)].all()
+    assert not taken[street.part(2.1, 9)].any()
 
 
 def test_two_bodies_leave_a_view_between_them():

@@ -21,7 +21,9 @@ from .warp import Map
 Floats = NDArray[np.float64]
 
 _ROWS = 160, 4  # of the small picture that is looked at: so many or, of more, every n-th
-_LEAST, _TALLEST = 0.5, 2.0  # m over the floor: what rises less is no body, none is taller
+# m over the floor: what rises less is no body (less than half as high as the camera, if that is
+# less), none is taller; and so tall may each be if the camera is lower: no mark reaches over that.
+_LEAST, _TALLEST, _CAR = 0.5, 2.0, 1.5
 _GAP = 0.6  # m: half of what a gap at its foot may be wide
 _RIM, _PLAIN = 0.2, 0.5  # m over the marks: may be a part; if it was not measured sharply
 _SHARP = 0.02  # relative standard deviation
@@ -83,7 +85,7 @@ def _standing(marks: Image8, foot: Floats,
 
     marks : (R, 2R), level; foot : (R,) inverse distance at which the floor is seen, 1/m
     """
-    around = marks.shape[1]
+    around, least = marks.shape[1], _CAR if camera < _CAR else 0
     wide = np.concatenate([marks, marks[:, :around // 4]], axis=1)  # on over the seam
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(wide, connectivity=8)
     for n in range(1, count):
@@ -93,12 +95,12 @@ def _standing(marks: Image8, foot: Floats,
         bottom = first + height - 1 - np.argmax(body[::-1], axis=0)
         near = foot[bottom]
         high = camera * (1 - foot[top] / np.maximum(near, 1e-6))
-        stands = (near > _STANDS / camera) & (high > _LEAST)
+        stands = (near > _STANDS / camera) & (high > min(_LEAST, 0.5 * camera))
         if stands.any():
             columns = np.arange(left, left + width) % around
             gap = _GAP * float(np.median(near[stands])) * around / (2 * np.pi)
             yield columns, *(_closed(np.where(stands, m, 0), gap)
-                             for m in (near, np.minimum(high, _TALLEST)))
+                             for m in (near, np.clip(high, least, _TALLEST)))
 
 
 def _closed(row: Floats, gap: float) -> Floats:
