@@ -1,6 +1,7 @@
 """How far a measurement errs, by what is round about."""
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from test_reliability import BASELINES, GRID, found, others_of
 
 from sphstereo_ros.bench.accuracy import as_frame
 from sphstereo_ros.bench.obstacles import frames_of_bag
-from sphstereo_ros.bench.surroundings import patches_of
+from sphstereo_ros.bench.surroundings import patches_of, render_way
 from sphstereo_ros.core import judgement
 from sphstereo_ros.core.alternatives import Alternative, Alternatives
 from sphstereo_ros.core.config import resolve
@@ -24,7 +25,7 @@ from sphstereo_ros.core.refinement import Agreement, Refined
 from sphstereo_ros.core.reliability import look, network, percentiles
 from sphstereo_ros.core.surroundings import CHANNELS, inputs, judged, likeliest
 from sphstereo_ros.scenes.binocular import render_binocular, save_binocular
-from sphstereo_ros.scenes.sequence import true_pose
+from sphstereo_ros.scenes.sequence import load_sequence, save_sequence, true_pose
 
 ROUND, BLOCK = 64, 32  # rows of half size beyond the seam; what sizes are multiples of
 
@@ -234,3 +235,32 @@ def test_a_pair_of_cameras_is_fitted_to(tmp_path):
     assert patch.error.shape == patch.true.shape == patch.weight.shape == (rows, columns)
     assert 0.9 < np.mean(patch.weight > 0) <= 1
     assert np.median(np.abs(patch.error[patch.weight > 0])) < 0.1
+
+
+@pytest.fixture(scope='module')
+def way(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp('ways')
+    render_way(folder, 'corridor', 1, 96, None, None)
+    return folder / 'corridor_1'
+
+
+def test_a_way_is_fitted_to_with_four_to_one_references(way):
+    ratios = [p.ratio for p in patches_of(way, np.random.default_rng(0))]
+    assert ratios == pytest.approx([0.1, 1 / 7, 1 / 4, 1], rel=0.05)
+
+
+def test_of_what_moves_the_fit_is_told_what_seems_too_far(way, tmp_path):
+    frames = list(load_sequence(way))
+    rows = np.arange(96)[:, None] + 0 * frames[-1].range
+    nearer, farther = rows < 30, rows > 65
+    moved = np.where(nearer, 0.5, np.where(farther, 2, 1)) * frames[-1].range
+    save_sequence([*frames[:-1], replace(frames[-1], range=moved, moving=nearer | farther)],
+                  tmp_path)
+    still, patch = (patches_of(folder, np.random.default_rng(0))[0] for folder in (way, tmp_path))
+    told = (patch.weight > 0) & (still.weight > 0)
+    too_far = told & (patch.error > still.error + 0.01)
+    assert 0.1 < np.mean(too_far) < 0.5
+    gone = (patch.weight == 0) & (still.weight > 0)
+    assert 0.1 < np.mean(gone) < 0.4
+    same = ~too_far & (np.abs(patch.error - still.error) < 0.01 + 0.01 * np.abs(still.error))
+    assert (too_far | same)[told].mean() > 0.99
