@@ -32,6 +32,7 @@ _AGREES, _SAME = 3.0, 0.02  # standard deviations, or share of the inverse range
 _CONFIRMS, _AGAIN, _BLIND = 0.3, 0.05, 0.05  # shares of it
 _GROWTH = 1.25  # of sigma from frame to frame
 _MOVES = 2.0  # px that something moves in the picture until the errors' correlation is an e-th
+_ALIKE = 0.1  # of it that stays, however much moves: rims, mirrors and weak texture go along
 _SURFACE = 2.0  # standard deviations: within, what moves to one pixel is one surface
 _PUBLISHED = 2.0  # evidence that is enough
 _UNSURE = 0.3  # of the range: with a larger sigma nothing is told to be near by
@@ -69,7 +70,7 @@ def _place_rows(first: int, last: int, old_rho: Map, cos_lat: Map, sin_lat: Map,
             scale[i, j] = np.float32(1) / np.sqrt(level + y * y)
             across = (y * c - z * b)**2 + (z * a - x * c)**2 + (x * b - y * a)**2
             move = np.sqrt(across) * scale[i, j]  # rad; what rotation moves shows the same
-            alike[i, j] = np.exp(-move * per_move)
+            alike[i, j] = np.float32(_ALIKE) + np.float32(1 - _ALIKE) * np.exp(-move * per_move)
             column[i, j] = _arctan2(x, z) * per_u + left
             row[i, j] = _arctan2(y, np.sqrt(level)) * per_v + top
 
