@@ -176,7 +176,7 @@ def test_frames_in_which_hardly_anything_moves_err_alike():
     pole, equator = share[HEIGHT // 2 - 1, 3 * HEIGHT // 2 - 1], share[4:-4, HEIGHT]
     assert pole > 0.9
     assert (equator < 0.8).all()
-    assert (equator > 0.7).all()  # errors of what moves much are somewhat alike, too
+    assert (equator > 0.675).all()  # errors of what moves much are somewhat alike, too
 
 
 @pytest.mark.parametrize(('scale', 'rho', 'sigma', 'told'), [
