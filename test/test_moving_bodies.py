@@ -64,6 +64,15 @@ def test_doors_without_a_mark_belong_to_it(azimuth, panes):
     assert taken[street.part(0.9, 1.5, -0.45, 0.45)].all()
 
 
+@pytest.mark.parametrize('camera', [0.05, 0.5, 1.6, 30.0])
+def test_what_carries_the_camera_hides_nothing_around(camera):
+    """A deck, a tripod, a roof: it keeps pace, too, where no vehicle mask was given."""
+    street = Street(camera=camera)
+    deck = street.tall < camera - AWAY * np.tan(np.radians(62))
+    assert 0.1 < deck.mean() < 0.2
+    assert not street.taken(deck).any()
+
+
 def test_over_a_low_camera_a_body_may_be_as_tall_as_a_car():
     street = Street(camera=0.5)
     taken = street.taken(street.part(0, 0.35))

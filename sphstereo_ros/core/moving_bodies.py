@@ -27,7 +27,9 @@ _LEAST, _TALLEST, _CAR = 0.5, 2.0, 1.5
 _GAP = 0.6  # m: half of what a gap at its foot may be wide
 _RIM, _PLAIN = 0.2, 0.5  # m over the marks: may be a part; if it was not measured sharply
 _SHARP = 0.02  # relative standard deviation
-_STANDS = 0.03  # rad below the horizon, at least, to tell how far away it stands
+# Tangent of how far below the horizon it stands: with less, nothing tells how far away; with more,
+# it is what carries the camera, which is no body that anything could belong to.
+_STANDS, _CARRIES = 0.03, 1.7
 _BEHIND, _CERTAIN = 1.3, 3.0  # times as far; standard deviations
 
 
@@ -95,7 +97,8 @@ def _standing(marks: Image8, foot: Floats,
         bottom = first + height - 1 - np.argmax(body[::-1], axis=0)
         near = foot[bottom]
         high = camera * (1 - foot[top] / np.maximum(near, 1e-6))
-        stands = (near > _STANDS / camera) & (high > min(_LEAST, 0.5 * camera))
+        stands = (near * camera > _STANDS) & (near * camera < _CARRIES)
+        stands &= high > min(_LEAST, 0.5 * camera)
         if stands.any():
             columns = np.arange(left, left + width) % around
             gap = _GAP * float(np.median(near[stands])) * around / (2 * np.pi)
@@ -105,7 +108,7 @@ def _standing(marks: Image8, foot: Floats,
 
 def _closed(row: Floats, gap: float) -> Floats:
     """Gaps of at most 2 · `gap` columns have the least of what is at their sides."""
-    reach = int(np.ceil(gap))
+    reach = min(int(np.ceil(gap)), len(row))
     wide = np.pad(row, reach)[None]  # the picture's rim is no mark
     closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, np.ones((1, 2 * reach + 1), np.uint8))
     return np.asarray(closed[0, reach:reach + len(row)], np.float64)
