@@ -233,6 +233,8 @@ def test_the_roof_of_what_keeps_pace_is_not_told_as_the_house_behind():
     assert (moving[roof] == 255).mean() < 0.5
     assert wrong[roof].mean() > 0.95
     assert wrong[~beside].mean() < 0.02
+    wrong, _ = moving_parts(known, new, DOWN, metric=False)  # how tall is that, in steps?
+    assert (wrong == (moving != 0))[roof].all()
 
 
 def test_specks_go_and_gaps_close_over_the_seam():

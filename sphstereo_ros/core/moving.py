@@ -197,14 +197,15 @@ def cleaned(mask: Image8) -> Image8:
     return np.ascontiguousarray(wide[:, rim:-rim])
 
 
-def moving_parts(known: Remembered, measured: Measurement,
-                 down: Floats) -> tuple[NDArray[np.bool_], Image8]:
+def moving_parts(known: Remembered, measured: Measurement, down: Floats, *,
+                 metric: bool = True) -> tuple[NDArray[np.bool_], Image8]:
     """Where range is wrong because something moves, and what moves.
 
     Parameters
     ----------
     known : what all frames so far tell; measured : what the newest one does
     down : (3,) unit vector, the vehicle's, optical frame
+    metric : whether ρ is 1/m: else nothing tells how tall things are, and only marks are wrong
 
     Returns
     -------
@@ -225,6 +226,6 @@ def moving_parts(known: Remembered, measured: Measurement,
         signs = signs | cv2.resize(under, half, interpolation=cv2.INTER_NEAREST)
     moving = np.asarray(cv2.resize(cleaned(signs), (width, height),
                                    interpolation=cv2.INTER_NEAREST), np.uint8)
-    if plane is not None:
+    if plane is not None and metric:
         wrong |= unmarked_parts(moving, known.rho, known.sigma, plane)
     return wrong | (moving != 0), moving

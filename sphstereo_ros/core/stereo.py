@@ -121,7 +121,7 @@ class SphericalStereo:
         fused = self._memory.fused(window.current.key, window.references, measured,
                                    None if mask is None else mask != 0)
         down = -mount(self.config.camera).rotation[2]
-        wrong, moving = moving_parts(fused, measured, down)
+        wrong, moving = moving_parts(fused, measured, down, metric=window.is_metric)
         if mask is not None:
             moving[mask != 0] = 0
         self._memory.forget(wrong)
