@@ -20,7 +20,7 @@ from .warp import Map
 
 Floats = NDArray[np.float64]
 
-_ROWS = 160, 4  # of the small picture that is looked at: so many or, of more, every n-th
+_ROWS, _STEP = 160, 4  # of the small picture that is looked at: so many or, of more, every n-th
 # m over the floor: what rises less is no body (less than half as high as the camera, if that is
 # less), none is taller; and so tall may each be if the camera is lower: no mark reaches over that.
 _LEAST, _TALLEST, _CAR = 0.5, 2.0, 1.5
@@ -45,7 +45,7 @@ def unmarked_parts(moving: Image8, rho: Map, sigma: Map, plane: Floats) -> NDArr
     Returns bool (H, 2H).
 
     """
-    rows = max(len(moving) // _ROWS[1], min(len(moving), _ROWS[0]))
+    rows = max(len(moving) // _STEP, min(len(moving), _ROWS))
     e0, e1, down = polar_axes(plane).T
     level = np.stack([e0, down, -e1])  # x right, y down, z ahead ← optical
     height = float(1 / np.linalg.norm(plane))
@@ -76,8 +76,8 @@ def _bodies(moving: Image8, level: Floats, camera: float, rows: int) -> tuple[Fl
     foot = np.tan(((np.arange(rows) + 0.5) / rows - 0.5) * np.pi) / camera
     nearness, tall = np.zeros((2, 2 * rows))
     for columns, near, high in _standing(np.asarray(marks, np.uint8), foot, camera):
-        nearness[columns] = np.maximum(nearness[columns], near)
-        tall[columns] = np.maximum(tall[columns], high)
+        np.maximum.at(nearness, columns, near)  # over the seam, columns may come twice
+        np.maximum.at(tall, columns, high)
     return nearness, tall
 
 
