@@ -21,7 +21,8 @@ def measurement(rho: float, sigma: float, told: float, frames: int) -> Measureme
     """A wall 20 m away, and in PATCH what is given."""
     full = np.full((ROWS, 2 * ROWS), 1 / 20, np.float32)
     found = Measurement(full, np.full_like(full, 0.002), full.copy(),
-                        np.ones(full.shape, np.int8), np.full_like(full, 0.001))
+                        np.ones(full.shape, np.int8), np.full_like(full, 0.001),
+                        np.zeros_like(full))
     for image, value in ((found.rho, rho), (found.sigma, sigma), (found.told, told),
                          (found.frames, frames)):
         image[PATCH] = value

@@ -203,7 +203,8 @@ def test_a_speck_under_the_floor_is_wrong_but_does_not_move():
     known = Remembered(rho.copy(), sigma.copy(), np.ones_like(rho))
     known.rho[140, 100] = 1 / 100
     known.sigma[140, 100] = 1e-3
-    new = Measurement(rho, sigma, rho.copy(), np.ones(rho.shape, np.int8), sigma)
+    new = Measurement(rho, sigma, rho.copy(), np.ones(rho.shape, np.int8), sigma,
+                      0 * sigma)
     wrong, moving = moving_parts(known, new, DOWN)
     assert np.argwhere(wrong).tolist() == [[140, 100]]
     assert not moving.any()
@@ -227,7 +228,8 @@ def test_the_roof_of_what_keeps_pace_is_not_told_as_the_house_behind():
                   for low, high in ((0, 0.8), (0.8, 1.2)))
     rho[body] = 0
     known = Remembered(rho, sigma, np.ones_like(rho))
-    new = Measurement(rho, sigma, rho.copy(), np.ones(rho.shape, np.int8), sigma)
+    new = Measurement(rho, sigma, rho.copy(), np.ones(rho.shape, np.int8), sigma,
+                      0 * sigma)
     wrong, moving = moving_parts(known, new, DOWN)
     assert (moving[body] == 255).mean() > 0.9
     assert (moving[roof] == 255).mean() < 0.5

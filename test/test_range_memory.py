@@ -32,7 +32,7 @@ def measurement(rho: np.ndarray | float, frames: np.ndarray | int = 1, sigma: fl
 
     rho = whole(rho, np.float32)
     return Measurement(rho, sigma * np.abs(rho), rho, whole(frames, np.int8),
-                       told * np.abs(rho))
+                       told * np.abs(rho), 0 * rho)
 
 
 @dataclass

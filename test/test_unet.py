@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sphstereo_ros.bench import match_judge, surroundings
+from sphstereo_ros.bench import match_judge, memory_judge, surroundings
 from sphstereo_ros.bench.unet import Design, kept_patches, plain
 
 torch = pytest.importorskip('torch')
@@ -13,7 +13,8 @@ pytest.importorskip('onnx')
 
 
 @pytest.mark.parametrize('shape', [(64, 64), (96, 32)])
-@pytest.mark.parametrize(('design', 'step'), [(surroundings.DESIGN, 1), (match_judge.DESIGN, 2)])
+@pytest.mark.parametrize(('design', 'step'), [(surroundings.DESIGN, 1), (match_judge.DESIGN, 2),
+                                              (memory_judge.DESIGN, 1)])
 def test_opencv_runs_what_was_fitted(design, step, shape):
     parts = design.begun(torch.Generator().manual_seed(1))
     net = cv2.dnn.readNetFromONNX(np.frombuffer(design.as_onnx(plain(parts)), np.uint8))

@@ -22,3 +22,12 @@ class Convolutions:
         with self._lock:  # a network of OpenCV holds what it computes
             self._net.setInput(x)
             return np.asarray(self._net.forward())
+
+
+def of_each_pixel(found: NDArray[np.float32], kinds: int) -> NDArray[np.float32]:
+    """Outputs at half size (1, 4 · kinds, rows, columns), of four pixels each, at full size:
+    (kinds, 2 rows, 2 columns).
+    """
+    rows, columns = found.shape[2:]
+    parts = found.reshape(kinds, 2, 2, rows, columns).transpose(0, 3, 1, 4, 2)
+    return np.ascontiguousarray(parts).reshape(kinds, 2 * rows, 2 * columns)

@@ -52,6 +52,7 @@ class Measurement:
     other : the second opinion by itself
     frames : int8, for how many frames of evidence it counts, as `Judged.frames`
     told : standard deviation by what the grey tells alone, if nothing misleads it
+    pose : the pose's share of sigma
     moving : uint8 (H // 2, 2 * (H // 2)), 255 = leaves its meridian; None if that was not measured
     """
 
@@ -60,6 +61,7 @@ class Measurement:
     other: Map
     frames: Evidence
     told: Map
+    pose: Map
     moving: Image8 | None = None
 
 
@@ -143,7 +145,7 @@ def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Ma
                   axes: Map, at_pole: Map, rho: Map, error: Map, frames: Evidence, other: Map,
                   baselines: Map, ways: Map, pose: Map, told: Map, per_unit: np.float32,
                   out: Map, sigma_out: Map, other_out: Map, frames_out: Evidence,
-                  told_out: Map) -> None:  # pragma: no cover - compiled
+                  told_out: Map, pose_out: Map) -> None:  # pragma: no cover - compiled
     """Sample the polar grid; σ of every pixel, with the pose's share.
 
     at_pole : column of the pole, row of the azimuth 0, rad of a pixel, px that no match beats;
@@ -183,6 +185,8 @@ def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Ma
             other_out[i, j] = other[rn, cn] * per_unit
             frames_out[i, j] = frames[rn, cn]
             told_out[i, j] = told[rn, cn] * per_unit
+            pose_out[i, j] = min(per_unit * np.sqrt(by_angle * by_angle + by_pose * by_pose),
+                                 nothing)
 
 
 def _scaled(most: int, least: int, height: int) -> int:
@@ -284,7 +288,7 @@ class JointMatcher:
     def _on_sphere(self, refined: Refined, judged: Judged, grid: PolarGrid, axes: Floats,
                    pairs: Sequence[tuple[Image8, RelativePose]], unit: float,
                    height: int) -> Measurement:
-        rho, sigma, second, told = (np.empty((height, 2 * height), np.float32) for _ in range(4))
+        rho, sigma, second, told, pose = np.empty((5, height, 2 * height), np.float32)
         noise = np.float32(DEPENDENT) / np.sqrt(np.maximum(refined.information, 1e-9))
         frames = np.empty(rho.shape, np.int8)
         at_pole = np.array([grid.margin - 0.5, grid.wrap - 0.5, grid.pixel, judged.floor],
@@ -296,5 +300,5 @@ class JointMatcher:
         rows_in_parallel(_measure_rows, height, *_grid_angles(height),
                          np.ascontiguousarray(axes, np.float32), at_pole, judged.rho,
                          judged.error, judged.frames, judged.other, baselines, ways, poses, noise,
-                         np.float32(1 / unit), rho, sigma, second, frames, told)
-        return Measurement(rho, sigma, second, frames, told)
+                         np.float32(1 / unit), rho, sigma, second, frames, told, pose)
+        return Measurement(rho, sigma, second, frames, told, pose)

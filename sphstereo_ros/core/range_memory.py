@@ -16,12 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .frames import FrameKey, Reference, RelativePose
+from .frames import FrameKey, Image8, Reference, RelativePose
 from .history import PoseHistory
 from .inverse_range import NOTHING, _grid_angles
 from .jit import fast_kernel, kernel, rows_in_parallel
 from .joint import Measurement, in_steps
 from .judgement import Evidence
+from .memory_judge import Opinions, judged
 from .reliability import NEAR_BY
 from .warp import Map, _arctan2
 
@@ -184,26 +185,40 @@ class RangeMemory:
         self._metric = True
 
     def fused(self, key: FrameKey, references: tuple[Reference, ...], new: Measurement,
-              vehicle: NDArray[np.bool_] | None = None) -> Remembered:
+              vehicle: NDArray[np.bool_] | None = None,
+              view: Image8 | None = None) -> Remembered:
         """Memory and the new measurement of frame `key` as one; it is the memory from now on.
 
-        The result has only what enough frames bear out, and nothing near by (`NEAR_BY` baselines)
-        that is uncertain.
+        The result is what is likeliest by its looks, where `view`, the frame's grey, is given and
+        something was remembered. Else it has only what enough frames bear out, and nothing near
+        by (`NEAR_BY` baselines) that is uncertain.
         """
         metric = all(r.pose.is_metric for r in references)
         frames = new.frames if vehicle is None else np.where(vehicle, np.int8(0), new.frames)
         moved, alike = self._moved(key, references, metric, new.rho.shape)
+        before = (moved.rho.copy(), moved.sigma.copy(), moved.evidence.copy(), alike)
         fade = self._fade(key)
         rows_in_parallel(_update_rows, len(new.rho), new.rho, new.sigma, new.told, frames, fade,
                          alike, moved.rho, moved.sigma, moved.evidence)
         self._key, self._kept, self._metric = key, moved, metric
         self._frames += 1
+        if view is not None and self._frames > 1:
+            opinions = Opinions((new.rho, new.sigma, new.other, new.told), frames, before,
+                                (moved.rho, moved.sigma, moved.evidence), new.pose)
+            return Remembered(*self._judged(view, opinions, references), moved.evidence)
         enough = (moved.evidence >= min(self._frames, _PUBLISHED)) & (frames >= 0)
         shortest = min(in_steps(r.pose).baseline for r in references)
         near_by = moved.rho * np.float32(NEAR_BY * shortest) > 1
         enough &= ~near_by | (moved.sigma < np.float32(_UNSURE) * moved.rho)
         return Remembered(moved.rho, np.where(enough, moved.sigma, np.float32(NOTHING)),
                           moved.evidence)
+
+    def _judged(self, view: Image8, opinions: Opinions, references: tuple[Reference, ...],
+                ) -> tuple[Map, Map]:
+        """The likeliest inverse range and its sigma."""
+        baselines = [in_steps(r.pose).baseline for r in references]
+        return judged(view, opinions, references[0].pose.direction,
+                      (min(baselines), max(baselines)))
 
     def forget(self, where: NDArray[np.bool_]) -> None:
         """Keep nothing of these pixels of the newest frame."""

@@ -55,6 +55,10 @@ class SphericalStereo:
         self._memory = RangeMemory(config.stereo.memory)
         self._mask = mask
 
+    def remember_in(self, memory: RangeMemory) -> None:
+        """Use another memory, which begins anew."""
+        self._memory = memory
+
     def warm_up(self) -> None:
         """Compile what `process` needs."""
         noise = np.random.default_rng(0).integers(0, 255, (128, 256), np.uint8)
@@ -119,7 +123,8 @@ class SphericalStereo:
         """What is known without what moves, and that."""
         measured = joint.measure(window.current, window.references)
         fused = self._memory.fused(window.current.key, window.references, measured,
-                                   None if mask is None else mask != 0)
+                                   None if mask is None else mask != 0,
+                                   window.current.image if joint.signed else None)
         down = -mount(self.config.camera).rotation[2]
         wrong, moving = moving_parts(fused, measured, down, metric=window.is_metric)
         if mask is not None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .alternatives import Alternatives
-from .convolutions import Convolutions
+from .convolutions import Convolutions, of_each_pixel
 from .frames import Image8
 from .jit import fast_kernel, rows_in_parallel
 from .matching import UNKNOWN
@@ -169,9 +169,7 @@ def judged(x: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32
     x : of `inputs`
     shape : of the polar grid
     """
-    found = interior(_network()(x), shape)
-    parts = found.reshape(_TOLD, 2, 2, *found.shape[2:])
-    return np.ascontiguousarray(parts.transpose(0, 3, 1, 4, 2)).reshape(_TOLD, *shape)
+    return of_each_pixel(interior(_network()(x), shape), _TOLD)
 
 
 @fast_kernel

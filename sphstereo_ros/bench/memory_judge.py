@@ -1,0 +1,258 @@
+"""Fits the network of `sphstereo_ros.core.memory_judge` to scenes with exact range.
+
+    python -m sphstereo_ros.bench.memory_judge render FOLDER
+    python -m sphstereo_ros.bench.memory_judge fit OUT.onnx FOLDER... [--patches DIR]
+
+FOLDER holds a rendered sequence of 14 frames. `fit` needs torch and onnx (extra `fit`); the
+package itself does without.
+"""
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from sphstereo_ros.core.config import resolve
+from sphstereo_ros.core.frames import AlignedWindow, Image8, Reference
+from sphstereo_ros.core.inverse_range import NOTHING
+from sphstereo_ros.core.memory_judge import (
+    BLOCK,
+    CHANNELS,
+    LEVEL,
+    SIGMAS,
+    VIEW,
+    Opinions,
+    inputs,
+    interior,
+    pixel_of,
+)
+from sphstereo_ros.core.range_memory import RangeMemory
+from sphstereo_ros.core.reliability import LEAST
+from sphstereo_ros.core.stereo import SphericalStereo
+from sphstereo_ros.core.warp import Map
+from sphstereo_ros.scenes.sequence import TruthFrame, load_sequence, render_sequence, true_pose
+
+from .accuracy import as_frame
+from .reliability import MOST, PERCENTILES, disturbed
+from .surroundings import _save
+from .unet import Design, Parameters, fit_arguments, percentile_loss, save_fit
+
+_FRAMES = 14
+# What is rendered beside the tuning seeds.
+_JOBS = (('street', 12, None), ('street', 13, None), ('takeoff', 14, None),
+         ('street', 16, 'traffic'), ('street', 17, None), ('street', 18, 'occlusion'),
+         ('street', 19, None), ('street', 22, None), ('takeoff', 26, None),
+         ('street', 24, 'low_light'), ('street', 27, None), ('street', 28, 'traffic'),
+         ('street', 29, None), ('corridor', 30, None), ('street', 31, 'exposure'),
+         ('street', 32, None), ('street', 33, 'wall'), ('street', 34, None))
+# Frames back of the references, the first frame that is measured, those that are kept, and whether
+# at half the size.
+_WINDOWS = (((1, 4, 7, 10), 4, (10, 12, 13), False), ((1,), 3, (6,), False),
+            ((1, 4, 7, 10), 6, (11, 13), True))
+# Weights of what is 10 to 100 m away, of what of it is over 30 m away, and of what is near but was
+# found far.
+_RARE, _RARER, _TOO_FAR = 2.0, 1.5, 2.0
+_WIDTHS, _LAST = (24, 32, 48, 64), 24
+_BEGIN = -2.3  # logarithm of the error that it starts from
+_ROWS, _COLUMNS, _BATCH, _RATE = 160, 240, 3, 3e-3
+_TRUE = 0.02  # share of a sample of which the truth has to be known
+# Of what is chosen: the logarithm of its error counts up to _WRONG; so much more where it is
+# farther than the truth by more than such a logarithm; and how much all that counts.
+_WRONG, _FARTHER, _WORSE, _CHOICE = 0.5, 0.35, 0.3, 4.0
+_POSES, _POSE = 0.3, 0.05  # share of samples of which poses are unsure, and by how much
+
+_OF_ERROR, _CHOSEN = len(PERCENTILES), 3
+DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
+                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * (4 * (_CHOSEN - 1)) + [1.0] * 4, deep=True)
+
+
+@dataclass(frozen=True)
+class Patch:
+    """What the network sees of a frame and should tell.
+
+    x : float16 (CHANNELS, rows, columns); found, true : float16 (2, 2 rows, 2 columns) and (2
+    rows, 2 columns), logarithms of how many times as large as measured the inverse range is that
+    was remembered, that both are as one, and the true one, a pixel of the longest baseline's
+    parallax added to each; weight : the same, 0 where the truth is unknown, or moves and is found
+    too near
+    """
+
+    x: NDArray[np.float16]
+    found: NDArray[np.float16]
+    true: NDArray[np.float16]
+    weight: NDArray[np.float16]
+
+
+def patch_of(truth: TruthFrame, view: Image8, opinions: Opinions, direction: NDArray[np.float64],
+             baselines: tuple[float, float]) -> Patch:
+    """What the network sees, and should tell, of a frame of even height; m."""
+    height = len(view)
+    pixel = pixel_of(height, baselines[1])
+    x = interior(inputs(view, opinions, direction, baselines), height)[0]
+    measured, true = opinions.measured[0], _true(truth)
+
+    def against(rho: Map, where: Any = True) -> Map:
+        found = np.log((np.maximum(rho, 0) + pixel) / (np.maximum(measured, 0) + pixel))
+        return np.asarray(np.where(where, found, 0), np.float32)
+    before, fused = (against(rho, sigma < NOTHING)
+                     for rho, sigma, *_ in (opinions.before, opinions.fused))
+    wanted = against(np.nan_to_num(true))
+    weight = np.isfinite(true) * _areas(height)
+    if truth.moving is not None:  # what moves seems near or far by its speed
+        weight *= ~truth.moving | (wanted > 0)
+    weight *= np.where((true > 0.01) & (true < 0.1), _RARE, 1)
+    weight *= np.where((true > 0.01) & (true < 1 / 30), _RARER, 1)
+    weight *= np.where((true > 0.1) & (wanted > np.log(1.5)), _TOO_FAR, 1)
+    return Patch(x.astype(np.float16), np.stack([before, fused]).astype(np.float16),
+                 wanted.astype(np.float16), weight.astype(np.float16))
+
+
+def _true(truth: TruthFrame) -> Map:
+    """Inverse range, 1/m; NaN where it is unknown."""
+    return np.asarray(1 / np.maximum(truth.range, 1e-3), np.float32)
+
+
+def _areas(height: int) -> Map:
+    latitude = np.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    return np.repeat(np.cos(latitude)[:, None], 2 * height, 1).astype(np.float32)
+
+
+class _Kept(RangeMemory):
+    """Keeps what there is to choose from, in place of a judgement."""
+
+    truth: TruthFrame
+    patch: Patch | None = None
+
+    def _judged(self, view: Image8, opinions: Opinions, references: tuple[Reference, ...],
+                ) -> tuple[Map, Map]:
+        baselines = [r.pose.baseline for r in references]
+        self.patch = patch_of(self.truth, view, opinions, references[0].pose.direction,
+                              (min(baselines), max(baselines)))
+        return opinions.fused[:2]
+
+
+def _halved(frame: TruthFrame) -> TruthFrame:
+    moving = None if frame.moving is None else frame.moving[::2, ::2]
+    small = cv2.resize(frame.image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return replace(frame, image=np.asarray(small, np.uint8), range=frame.range[::2, ::2],
+                   moving=moving)
+
+
+def patches_of(folder: Path, rng: np.random.Generator) -> list[Patch]:
+    """Patches of frames of a rendered sequence."""
+    found = []
+    for intervals, first, kept, half in _WINDOWS:
+        sequence = [_halved(f) for f in load_sequence(folder)] if half else load_sequence(folder)
+        stereo = SphericalStereo(resolve({}))
+        memory = _Kept(stereo.config.stereo.memory)
+        stereo.remember_in(memory)
+        for current in range(first, max(kept) + 1):
+            truth = memory.truth = sequence[current]
+            stereo.process(AlignedWindow(as_frame(truth, 0), tuple(
+                Reference(as_frame(sequence[current - k], 0),
+                          disturbed(true_pose(sequence[current - k], truth), rng))
+                for k in intervals if k <= current)))
+            if current in kept and memory.patch is not None:
+                found.append(memory.patch)
+    return found
+
+
+def render(folder: Path) -> None:
+    """Scenes beside those of the tuning seeds."""
+    for name, seed, nuisance in tqdm(_JOBS, unit='scene'):
+        if not (target := folder / f'{name}_{seed}').exists():
+            sequence = render_sequence(name, seed, _FRAMES, 480 if name == 'corridor' else 960,
+                                       nuisance=nuisance)
+            _save([sequence[k] for k in range(_FRAMES)], target, name)
+
+
+def loss(out: Any, x: Any, found: Any, true: Any, weight: Any) -> Any:
+    """Of the percentiles of what is chosen, and of the choice."""
+    import torch
+    from torch.nn import functional
+    told = functional.pixel_shuffle(out, 2)
+    level = functional.pixel_shuffle(x[:, LEVEL:LEVEL + 4], 2)
+    each = torch.cat([torch.zeros_like(true), found], 1)
+    nearer = true - each
+    wrong = nearer.abs().clamp(max=_WRONG) + _WORSE * (nearer > _FARTHER)
+    choices = told[:, _OF_ERROR:]
+    chosen = (torch.softmax(choices, 1) * wrong).sum(1, keepdim=True)
+    likeliest = torch.exp(level + each.gather(1, choices.argmax(1, keepdim=True))) - 1
+    off = (torch.exp(level + true) - 1 - likeliest) / likeliest.clamp(min=1)
+    return (percentile_loss(told[:, :_OF_ERROR], off, weight, LEAST, MOST, PERCENTILES)
+            + _CHOICE * (weight * chosen).sum() / weight.sum())
+
+
+def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, ...]:
+    """A part of a patch, in another light, with less sure poses, or mirrored."""
+    import torch
+    x, maps = _part(patch, rng)
+    x[:, VIEW:VIEW + 4] = (x[:, VIEW:VIEW + 4] * float(np.exp(rng.normal(0, 0.25)))
+                           + float(rng.normal(0, 0.3))).clamp(-2, 2)
+    if rng.random() < _POSES:
+        share = _POSE * float(rng.random())
+        for at in SIGMAS:
+            x[:, at:at + 4] = 0.5 * torch.log(torch.exp(2 * x[:, at:at + 4]) + share**2)
+    if rng.random() < 0.5:
+        x, *maps = (torch.flip(m, [3]) for m in (x, *maps))
+        for at in range(0, CHANNELS // 4 * 4, 4):
+            x[:, at:at + 4] = x[:, at:at + 4][:, [1, 0, 3, 2]]
+    return x, x, *maps
+
+
+def _part(patch: Patch, rng: np.random.Generator) -> tuple[Any, list[Any]]:
+    """Inputs, and what was found, truth and weight, of a part of a patch."""
+    import torch
+    rows, columns = (min(n, size // BLOCK * BLOCK) for n, size in zip(
+        (_ROWS, _COLUMNS), patch.x.shape[1:], strict=True))
+    top, left = (int(rng.integers(0, size - n + 1)) for n, size in zip(
+        (rows, columns), patch.x.shape[1:], strict=True))
+    at = np.s_[..., 2 * top:2 * (top + rows), 2 * left:2 * (left + columns)]
+    x = patch.x[:, top:top + rows, left:left + columns].astype(np.float32)
+    maps = [torch.from_numpy(np.atleast_3d(m[at].astype(np.float32).T).T[None])
+            for m in (patch.found, patch.true, patch.weight)]
+    return torch.from_numpy(x)[None], maps
+
+
+def _drawn(patches: Sequence[Patch], rng: np.random.Generator) -> tuple[Any, ...]:
+    while True:
+        sample = _varied(patches[int(rng.integers(len(patches)))], rng)
+        if float(sample[4].mean()) > _TRUE:
+            return sample
+
+
+def fit(patches: Sequence[Patch], steps: int, rng: np.random.Generator,
+        start: dict[str, NDArray[np.float32]] | None = None,
+        bfloat16: bool = False) -> Parameters:
+    """Weights after so many steps, as of `Design.fitted`.
+
+    Raises ValueError where of no patch enough of the truth is known.
+    """
+    known = [p for p in patches if p.weight.mean(dtype=np.float64) > _TRUE]
+    if not known:
+        raise ValueError('of no patch enough of the truth is known')
+    return DESIGN.fitted(lambda: _drawn(known, rng), loss, steps, _BATCH, start, _RATE, bfloat16)
+
+
+def main() -> None:
+    """Render, or fit and save."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
+    commands = parser.add_subparsers(dest='command', required=True)
+    commands.add_parser('render').add_argument('folder', type=Path)
+    fit_arguments(commands.add_parser('fit'), 6000)
+    given = parser.parse_args()
+    if given.command == 'render':
+        render(given.folder)
+    else:
+        save_fit(given, DESIGN, Patch, patches_of, fit)
+
+
+if __name__ == '__main__':
+    main()

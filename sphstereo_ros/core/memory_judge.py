@@ -1,0 +1,234 @@
+"""What is measured and what is remembered, of which the likelier is told: by what is round about.
+
+Evidence counts frames, pixel by pixel. Where a frame may be believed that contradicts what is
+remembered, and where all of them err alike, shows only in how both differ round about: along a
+rim, on a pane, between leaves. A convolutional network (a U-net, Ronneberger et al. 2015), at half
+size and run by OpenCV, sees the newest measurement, what was remembered, and both as one; it
+chooses between them, and tells percentiles of the error of what it chose. It only reads: what is
+remembered goes on as it is (`range_memory`). It was fitted to rendered scenes with exact range
+(`sphstereo_ros.bench.memory_judge`).
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .convolutions import Convolutions, of_each_pixel
+from .frames import Image8
+from .inverse_range import NOTHING, _grid_angles
+from .jit import fast_kernel, rows_in_parallel
+from .judgement import Evidence
+from .match_judge import likely_error
+from .reliability import LEAST, NEAR_BY, logarithms
+from .warp import Map
+
+_EACH = 14  # inputs of each pixel
+CHANNELS = 4 * _EACH + 2  # and of each four
+LEVEL, SIGMAS, VIEW = 0, (4, 32, 48), 20  # inputs: where those of four pixels begin
+_TOLD = 6  # outputs for each pixel
+BLOCK = 8  # px at half size: what the network halves three times
+ROUND = 16  # px at half size that it sees beyond the seam
+_LEAST, _MOST = np.float32(1e-3), np.float32(10)  # shares that sigma counts for
+_APART = np.float32(2)  # logarithm by which inverse ranges differ at most, or share
+_EVIDENCE = np.float32(1 / 6)
+_LOGARITHMS = (*range(4), *range(4, 8), *range(16, 20), *range(28, 36), *range(44, 52), 57)
+_TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
+# Of the unit: errors that two thirds stay under where it is told, near by, farther, and beyond
+# _FAR shortest baselines; and what may be nearer with which nothing is told near by.
+_SURE_NEAR, _SURE, _SURE_FAR, _FAR, _NEARER = 0.4, 0.3, 0.45, 100.0, 0.4
+_BEFORE = 1.3  # times as far away as what the newest frame is believed to see near by
+
+
+@dataclass(frozen=True)
+class Opinions:
+    """What there is to choose from, float32 (H, 2H); inverse ranges and standard deviations, 1/m.
+
+    measured : inverse range, sigma, second opinion, and sigma by what the grey tells alone, of the
+    newest frame; frames : for how many frames of evidence it counts, −1 = something may be much
+    nearer, and nothing is told
+    before : inverse range, sigma (NOTHING where unknown) and evidence of what was remembered, and
+    how much its errors are like those of the newest frame
+    fused : inverse range, sigma and evidence of both as one
+    pose : the pose's share of sigma
+    """
+
+    measured: tuple[Map, Map, Map, Map]
+    frames: Evidence
+    before: tuple[Map, Map, Map, Map]
+    fused: tuple[Map, Map, Map]
+    pose: Map
+
+
+@fast_kernel
+def _share(sigma: np.float32, unit: np.float32) -> np.float32:  # pragma: no cover - compiled
+    return _LEAST + min(sigma / unit, _MOST)
+
+
+@fast_kernel
+def _differs(rho: np.float32, level: np.float32,
+             pixel: np.float32) -> np.float32:  # pragma: no cover - compiled
+    """Ratio of inverse ranges, a pixel added to each."""
+    return (max(rho, np.float32(0)) + pixel) / (pixel * level)
+
+
+@fast_kernel
+def _input(view: Image8, measured: tuple[Map, ...], frames: Evidence, before: tuple[Map, ...],
+           fused: tuple[Map, ...], pixel: np.float32, r: int, c: int, n: int, x: Map,
+           p: int) -> None:  # pragma: no cover - compiled
+    """Column p of `x`, of pixel (r, c), the n-th of its four, before logarithms."""
+    one, nothing = np.float32(1), np.float32(NOTHING)
+    rho, old, both = measured[0][r, c], before[0][r, c], fused[0][r, c]
+    unit = max(rho, pixel)
+    level = one + max(rho, np.float32(0)) / pixel
+    x[n, p] = level
+    x[4 + n, p] = _share(measured[1][r, c], unit)
+    x[8 + n, p] = np.float32(frames[r, c])
+    x[12 + n, p] = min(max((measured[2][r, c] - rho) / unit, -_APART), _APART)
+    x[16 + n, p] = _share(measured[3][r, c], unit)
+    x[20 + n, p] = (np.float32(view[r, c]) - np.float32(128)) * np.float32(1 / 64)
+    was = before[1][r, c] < nothing
+    x[24 + n, p] = one if was else np.float32(0)
+    x[28 + n, p] = _differs(old, level, pixel) if was else one
+    x[32 + n, p] = _share(before[1][r, c], max(old, pixel))
+    x[36 + n, p] = _EVIDENCE * before[2][r, c] if was else np.float32(0)
+    x[40 + n, p] = before[3][r, c]
+    known = fused[1][r, c] < nothing
+    x[44 + n, p] = _differs(both, level, pixel) if known else one
+    x[48 + n, p] = _share(fused[1][r, c], max(both, pixel))
+    x[52 + n, p] = _EVIDENCE * max(fused[2][r, c], np.float32(0))
+
+
+@fast_kernel
+def _input_rows(first: int, last: int, view: Image8, measured: tuple[Map, ...], frames: Evidence,
+                before: tuple[Map, ...], fused: tuple[Map, ...], sine: Map, scale: Map,
+                out: NDArray[np.float32]) -> None:  # pragma: no cover - compiled
+    """Rows of `out` (1, CHANNELS, …): on round the sphere, at the end as the last."""
+    height, width = view.shape
+    x = np.empty((CHANNELS, BLOCK), np.float32)
+    for i in range(first, last):
+        for start in range(0, out.shape[3], BLOCK):
+            for p in range(BLOCK):
+                for n in range(4):
+                    r = min(2 * i + (n >> 1), height - 1)
+                    c = (2 * (start + p - ROUND) + (n & 1)) % width
+                    _input(view, measured, frames, before, fused, scale[0], r, c, n, x, p)
+                    x[56, p], x[57, p] = sine[r, c], scale[1]
+            logarithms(x, _LOGARITHMS)
+            for k in range(28, 32):
+                for p in range(BLOCK):
+                    x[k, p] = min(max(x[k, p], -_APART), _APART)
+                    x[k + 16, p] = min(max(x[k + 16, p], -_APART), _APART)
+            for k in range(CHANNELS):
+                for p in range(BLOCK):
+                    out[0, k, i, start + p] = x[k, p]
+
+
+def _sine(height: int, direction: NDArray[np.float64]) -> Map:
+    """Of the angle from the direction of motion, of every pixel."""
+    cos_lat, sin_lat, cos_lon, sin_lon = _grid_angles(height)
+    x, y, z = direction.astype(np.float32)
+    along = cos_lat[:, None] * (x * sin_lon + z * cos_lon) - (y * sin_lat)[:, None]
+    return np.asarray(np.sqrt(np.maximum(1 - along * along, 0)), np.float32)
+
+
+def pixel_of(height: int, longest: float) -> np.float32:
+    """Inverse range, 1/m, of one pixel of parallax at right angles to the longest baseline, m."""
+    return np.float32(np.pi / (height * longest))
+
+
+def inputs(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
+           baselines: tuple[float, float]) -> NDArray[np.float32]:
+    """What the network sees: float32 (1, CHANNELS, rows, columns), half the image's size and more,
+    so that it can be halved again and goes on beyond the seam.
+
+    Parameters
+    ----------
+    view : the current frame, grey (H, 2H)
+    direction : of motion, in its frame
+    baselines : the shortest and the longest, m
+
+    """
+    height = len(view)
+    rows, columns = -(-height // 2), height
+    size = [-(-n // BLOCK) * BLOCK for n in (rows, columns + 2 * ROUND)]
+    out = np.empty((1, CHANNELS, *size), np.float32)
+    shortest, longest = baselines
+    scale = np.array([pixel_of(height, longest), shortest / longest], np.float32)
+    rows_in_parallel(_input_rows, size[0], view, opinions.measured, opinions.frames,
+                     opinions.before, opinions.fused, _sine(height, direction), scale, out)
+    return out
+
+
+def interior(maps: NDArray[np.float32], height: int) -> NDArray[np.float32]:
+    """Of maps as large as `inputs`, what lies on the image of `height` rows, at half its size."""
+    return maps[:, :, :-(-height // 2), ROUND:ROUND + height]
+
+
+@cache
+def _network() -> Convolutions:
+    return Convolutions('memory_judge.onnx')
+
+
+@fast_kernel
+def _near_by(rho: np.float32, baseline: np.float32) -> bool:  # pragma: no cover - compiled
+    return bool(rho * baseline * np.float32(NEAR_BY) > 1)
+
+
+@fast_kernel
+def _sure(rho: np.float32, baseline: np.float32) -> np.float32:  # pragma: no cover - compiled
+    """Share of the unit that two thirds of the errors have to stay under."""
+    if _near_by(rho, baseline):
+        return np.float32(_SURE_NEAR)
+    return np.float32(_SURE if rho * baseline * np.float32(_FAR) > 1 else _SURE_FAR)
+
+
+@fast_kernel
+def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tuple[Map, ...],
+                frames: Evidence, before: tuple[Map, ...], fused: tuple[Map, ...], pose: Map,
+                scale: Map, rho: Map, sigma: Map) -> None:  # pragma: no cover - compiled
+    """scale : inverse range of a pixel, shortest baseline, share of the 95th percentile"""
+    nothing, least, pixel = np.float32(NOTHING), np.float32(LEAST), scale[0]
+    for i in range(first, last):
+        for j in range(rho.shape[1]):
+            best, most = measured[0][i, j], told[3, i, j]
+            if before[1][i, j] < nothing and told[4, i, j] > most:
+                best, most = before[0][i, j], told[4, i, j]
+            if fused[1][i, j] < nothing and told[5, i, j] > most:
+                best = fused[0][i, j]
+            unit = max(best, pixel)
+            nearer = np.exp(told[2, i, j]) - least
+            hides = nearer > np.float32(_NEARER) and _near_by(best + nearer * unit, scale[1])
+            hides |= frames[i, j] > 0 and _near_by(measured[0][i, j], scale[1]) and (
+                measured[0][i, j] > np.float32(_BEFORE) * best)
+            own = likely_error(told, 0, i, j, scale[2]) * unit
+            rho[i, j], sigma[i, j] = best, nothing
+            sure = np.exp(told[0, i, j]) - least <= _sure(best, scale[1])
+            if sure and not hides and frames[i, j] >= 0:
+                sigma[i, j] = np.sqrt(own * own + pose[i, j] * pose[i, j])
+
+
+def told(x: NDArray[np.float32], height: int) -> NDArray[np.float32]:
+    """The network's outputs, float32 (6, H, 2H): logarithms of the 68th and 95th percentile of the
+    error of what is chosen and of the 98th of how much nearer the truth may be, as shares of the
+    inverse range (at least of `pixel_of`), with LEAST added; and three by which what was measured,
+    remembered, or both as one is chosen.
+    """
+    whole = of_each_pixel(interior(_network()(x), height), _TOLD)
+    return np.ascontiguousarray(whole[:, :height])
+
+
+def judged(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
+           baselines: tuple[float, float]) -> tuple[Map, Map]:
+    """Inverse range and its standard deviation, NOTHING where none is told, float32 (H, 2H), 1/m.
+
+    As of `inputs`.
+    """
+    outputs = told(inputs(view, opinions, direction, baselines), len(view))
+    rho, sigma = np.empty((2, *view.shape), np.float32)
+    scale = np.array([pixel_of(len(view), baselines[1]), baselines[0], np.exp(-_TAIL)], np.float32)
+    rows_in_parallel(_judge_rows, len(rho), outputs, opinions.measured, opinions.frames,
+                     opinions.before, opinions.fused, opinions.pose, scale, rho, sigma)
+    return rho, sigma

@@ -1,0 +1,195 @@
+"""What is measured and what is remembered, of which the likelier is told."""
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sphstereo_ros.core import memory_judge
+from sphstereo_ros.core.inverse_range import NOTHING
+from sphstereo_ros.core.memory_judge import (
+    BLOCK,
+    CHANNELS,
+    ROUND,
+    Opinions,
+    inputs,
+    interior,
+    judged,
+    pixel_of,
+)
+from sphstereo_ros.core.reliability import LEAST, NEAR_BY
+
+HEIGHT = 32
+AHEAD = np.array([0.0, 0.0, 1.0])
+BASELINES = (0.3, 3.0)
+MEASURED, REMEMBERED, BOTH = 0.1, 0.08, 0.09  # 1/m
+PIXEL = pixel_of(HEIGHT, BASELINES[1])
+
+
+def whole(value: object, kind: type = np.float32, height: int = HEIGHT) -> np.ndarray:
+    return np.ascontiguousarray(np.broadcast_to(value, (height, 2 * height)), kind)
+
+
+def opinions(height: int = HEIGHT, *, remembered: bool = True, pose: float = 0.0) -> Opinions:
+    known = 0.005 if remembered else NOTHING
+    old, both = (REMEMBERED, BOTH) if remembered else (0, MEASURED)
+    return Opinions(tuple(whole(v, height=height) for v in (MEASURED, 0.01, 0.12, 0.02)),
+                    whole(2, np.int8, height),
+                    tuple(whole(v, height=height) for v in (old, known, 3, 0.4)),
+                    tuple(whole(v, height=height) for v in (both, 0.004, 5)),
+                    whole(pose, height=height))
+
+
+def view(height: int = HEIGHT) -> np.ndarray:
+    return whole(192, np.uint8, height)
+
+
+class Tells:
+    """In place of the network: the same everywhere, shares of the inverse range and choices."""
+
+    def __init__(self, likely: float, nearer: float, choices: tuple[float, float, float]) -> None:
+        self.outputs = [*np.log(np.array([likely, likely, nearer]) + LEAST), *choices]
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        out = np.repeat(np.asarray(self.outputs, np.float32), 4)
+        return np.ascontiguousarray(np.broadcast_to(
+            out[None, :, None, None], (1, len(out), *x.shape[2:])))
+
+
+def told(monkeypatch: pytest.MonkeyPatch, net: object, given: Opinions) -> tuple[np.ndarray, ...]:
+    monkeypatch.setattr(memory_judge, '_network', lambda: net)
+    return judged(view(len(given.pose)), given, AHEAD, BASELINES)
+
+
+@pytest.mark.parametrize(('choices', 'rho'), [
+    ((1, 0, 0), MEASURED), ((0, 1, 0), REMEMBERED), ((0, 0, 1), BOTH)])
+def test_the_likeliest_is_told_with_its_error(monkeypatch, choices, rho):
+    found, sigma = told(monkeypatch, Tells(0.1, 0.05, choices), opinions(pose=0.003))
+    np.testing.assert_allclose(found, rho, rtol=1e-6)
+    np.testing.assert_allclose(sigma, np.hypot(0.1 * rho, 0.003), rtol=1e-3)
+
+
+def test_what_was_not_remembered_is_not_chosen(monkeypatch):
+    found, sigma = told(monkeypatch, Tells(0.1, 0.05, (0, 9, 1)), opinions(remembered=False))
+    np.testing.assert_allclose(found, MEASURED, rtol=1e-6)
+    assert (sigma < NOTHING).all()
+
+
+def test_the_error_is_a_share_of_a_pixel_at_least(monkeypatch):
+    given = opinions(remembered=False)
+    given.measured[0][:] = given.fused[0][:] = 0
+    found, sigma = told(monkeypatch, Tells(0.1, 0.05, (1, 0, 0)), given)
+    assert not found.any()
+    np.testing.assert_allclose(sigma, 0.1 * PIXEL, rtol=1e-3)
+
+
+def test_what_is_likely_wrong_is_unknown(monkeypatch):
+    _, sigma = told(monkeypatch, Tells(0.9, 0.05, (1, 0, 0)), opinions())
+    assert (sigma == NOTHING).all()
+
+
+@pytest.mark.parametrize('near', [True, False])
+def test_where_something_may_be_much_nearer_nothing_is_told_near_by(monkeypatch, near):
+    given = opinions()
+    share = 1.4 if near else 0.3
+    given.measured[0][:] = share / (NEAR_BY * BASELINES[0]) / 1.9
+    _, sigma = told(monkeypatch, Tells(0.1, 0.9, (1, 0, 0)), given)
+    assert ((sigma == NOTHING) == near).all()
+
+
+def test_where_the_newest_frame_may_hide_something_near_nothing_is_told(monkeypatch):
+    given = opinions()
+    given.frames[4, 7] = -1
+    _, sigma = told(monkeypatch, Tells(0.1, 0.05, (0, 0, 1)), given)
+    assert np.argwhere(sigma == NOTHING).tolist() == [[4, 7]]
+
+
+@pytest.mark.parametrize(('ratio', 'frames', 'known'), [
+    (1.4, 1, False), (1.2, 1, True), (1.4, 0, True)])
+def test_nothing_is_told_behind_what_the_newest_frame_sees_near_by(monkeypatch, ratio, frames,
+                                                                   known):
+    given = opinions()
+    given.measured[0][:] = 1.1 / (NEAR_BY * BASELINES[0])
+    given.before[0][:] = given.measured[0] / ratio
+    given.frames[:] = frames
+    _, sigma = told(monkeypatch, Tells(0.1, 0.05, (0, 1, 0)), given)
+    assert ((sigma < NOTHING) == known).all()
+
+
+@pytest.mark.parametrize(('baselines', 'known'), [(39, True), (41, False), (99, False),
+                                                  (101, True)])
+def test_how_sure_it_has_to_be_hangs_on_how_far_away_it_is(monkeypatch, baselines, known):
+    given = opinions()
+    given.measured[0][:] = 1 / (baselines * BASELINES[0])
+    likely = 0.37 if baselines < 99.5 else 0.42
+    _, sigma = told(monkeypatch, Tells(likely, 0.05, (1, 0, 0)), given)
+    assert ((sigma < NOTHING) == known).all()
+
+
+def test_what_the_network_sees():
+    given = opinions()
+    given.measured[0][6, 9] = 0.2
+    x = inputs(view(), given, AHEAD, BASELINES)
+    assert x.shape[1] == CHANNELS
+    assert x.shape[2] % BLOCK == x.shape[3] % BLOCK == 0
+    inside = interior(x, HEIGHT)[0]
+    assert inside.shape[1:] == (HEIGHT // 2, HEIGHT)
+    n, at = 1, (3, 4)  # the upper right of its four
+    wanted = [np.log(1 + 0.2 / PIXEL), np.log(0.001 + 0.01 / 0.2), 2, (0.12 - 0.2) / 0.2,
+              np.log(0.001 + 0.02 / 0.2), 1, 1, np.log((0.08 + PIXEL) / (0.2 + PIXEL)),
+              np.log(0.001 + 0.005 / 0.08), 0.5, 0.4, np.log((0.09 + PIXEL) / (0.2 + PIXEL)),
+              np.log(0.001 + 0.004 / 0.09), 5 / 6]
+    np.testing.assert_allclose(inside[(slice(n, 56, 4), *at)], wanted, atol=1e-3)
+    elsewhere = inside[0, 3, 4]
+    assert elsewhere == pytest.approx(np.log(1 + 0.1 / PIXEL), abs=1e-3)
+    assert inside[57].mean() == pytest.approx(np.log(0.1), abs=1e-3)
+    longitude = (np.arange(HEIGHT) + 0.75) / HEIGHT * 2 * np.pi - np.pi
+    along = np.cos(longitude) * np.cos(1.5 / HEIGHT * np.pi)
+    np.testing.assert_allclose(inside[56, HEIGHT // 4], np.sqrt(1 - along**2), atol=1e-3)
+
+
+def test_nothing_remembered_looks_like_nothing():
+    x = interior(inputs(view(), opinions(remembered=False), AHEAD, BASELINES), HEIGHT)[0]
+    np.testing.assert_allclose(x[24:32], 0, atol=1e-3)
+    np.testing.assert_allclose(x[32:36], np.log(10.001), atol=1e-3)
+    assert not x[36:40].any()
+    np.testing.assert_allclose(x[44:48], 0, atol=1e-3)
+
+
+def test_it_goes_on_round_the_sphere():
+    given = opinions()
+    given.measured[0][:, :2] = 0.3
+    x = inputs(view(), given, AHEAD, BASELINES)
+    np.testing.assert_array_equal(x[0, :56, :, ROUND], x[0, :56, :, ROUND + HEIGHT])
+    turned = opinions()
+    turned.measured[0][:, 20:22] = 0.3
+    turned = inputs(view(), turned, AHEAD, BASELINES)
+    np.testing.assert_array_equal(interior(turned, HEIGHT)[0, :56, :, 10],
+                                  interior(x, HEIGHT)[0, :56, :, 0])
+
+
+@settings(deadline=None, max_examples=25)
+@given(height=st.integers(16, 70), seed=st.integers(0, 2**32 - 1))
+def test_whatever_it_sees_what_it_tells_is_one_of_them(height, seed):
+    rng = np.random.default_rng(seed)
+    shape = (height, 2 * height)
+
+    def some(low: float, high: float) -> np.ndarray:
+        return rng.uniform(low, high, shape).astype(np.float32)
+    unknown = rng.random((2, *shape)) < 0.3
+    given = Opinions((some(-0.01, 1), some(1e-6, 2), some(-0.1, 2), some(1e-6, 1e6)),
+                     rng.integers(-1, 3, shape).astype(np.int8),
+                     (some(0, 1), np.where(unknown[0], NOTHING, some(1e-6, 2)).astype(np.float32),
+                      some(-2, 6), some(0, 1)),
+                     (some(0, 1), np.where(unknown[1], NOTHING, some(1e-6, 2)).astype(np.float32),
+                      some(-2, 6)), some(0, 0.1))
+    grey = rng.integers(0, 256, shape).astype(np.uint8)
+    x = inputs(grey, given, AHEAD, BASELINES)
+    assert np.isfinite(x).all()
+    rho, sigma = judged(grey, given, AHEAD, BASELINES)
+    assert rho.shape == sigma.shape == shape
+    old, both = ((rho == m[0]) & (m[1] < NOTHING) for m in (given.before, given.fused))
+    assert ((rho == given.measured[0]) | old | both).all()
+    assert ((sigma == NOTHING) | (sigma >= given.pose)).all()
+    assert (sigma > 0).all()

@@ -1,0 +1,102 @@
+"""The network that chooses between what is measured and remembered, while it is fitted."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_memory_judge import AHEAD, BASELINES, HEIGHT, MEASURED, PIXEL, opinions, view
+
+from sphstereo_ros.bench.memory_judge import DESIGN, Patch, fit, loss, patch_of
+from sphstereo_ros.core.memory_judge import CHANNELS
+from sphstereo_ros.scenes.sequence import TruthFrame
+
+
+def truth(distance: float, moving: bool = False) -> TruthFrame:
+    shape = (HEIGHT, 2 * HEIGHT)
+    mask = np.full(shape, moving)
+    return TruthFrame(0, np.zeros((*shape, 3), np.uint8), np.full(shape, distance), np.eye(3),
+                      np.zeros(3), moving=mask)
+
+
+def patch(distance: float, moving: bool = False) -> Patch:
+    return patch_of(truth(distance, moving), view(), opinions(), AHEAD, BASELINES)
+
+
+def test_a_patch_tells_how_far_each_is_from_the_truth():
+    found = patch(8.0)
+    true, old, both = ((rho + PIXEL) / (MEASURED + PIXEL) for rho in (1 / 8, 0.08, 0.09))
+    np.testing.assert_allclose(found.true, np.log(true), atol=1e-3)
+    np.testing.assert_allclose(found.found[0], np.log(old), atol=1e-3)
+    np.testing.assert_allclose(found.found[1], np.log(both), atol=1e-3)
+    assert found.x.shape == (CHANNELS, HEIGHT // 2, HEIGHT)
+
+
+def test_the_sky_is_a_truth_and_what_is_unknown_is_none():
+    sky = patch(np.inf)
+    np.testing.assert_allclose(sky.true, np.log(PIXEL / (MEASURED + PIXEL)), atol=2e-3)
+    assert (sky.weight > 0).all()
+    assert not patch(np.nan).weight.any()
+
+
+def test_of_what_moves_only_what_was_found_too_far_counts():
+    assert (patch(8.0, moving=True).weight > 0).all()
+    assert not patch(12.0, moving=True).weight.any()
+
+
+def test_far_things_count_more_and_near_ones_that_were_found_far():
+    row = HEIGHT // 2
+    weights = [float(patch(d).weight[row, 0]) for d in (8.0, 20.0, 50.0, 5.0, 200.0)]
+    np.testing.assert_allclose(weights, np.array([1, 2, 3, 2, 1]) * weights[0], rtol=1e-2)
+
+
+def samples(rng: np.random.Generator) -> Patch:
+    """Where grey is high, what was remembered is right, else what was measured; both are sure."""
+    size = (64, 64)
+    x = rng.normal(0, 0.1, (CHANNELS, *size)).astype(np.float32)
+    x[0:4], x[20:24] = 3.0, 0.0
+    x[20:24, :, 32:] = 1.0
+    right = np.broadcast_to(np.arange(128) >= 64, (128, 128))
+    found = np.stack([np.full((128, 128), -0.4), np.full((128, 128), -0.2)])
+    true = np.where(right, -0.4, 0.0) + rng.normal(0, 0.01, (128, 128))
+    maps = [m.astype(np.float16) for m in (found, true, np.ones((128, 128)))]
+    return Patch(x.astype(np.float16), *maps)
+
+
+def test_a_fit_chooses_and_tells_the_error():
+    torch = pytest.importorskip('torch')
+    pytest.importorskip('onnx')
+    rng = np.random.default_rng(0)
+    given = samples(rng)
+    parts = fit([given], 200, rng)
+    with torch.no_grad():
+        x = torch.from_numpy(given.x.astype(np.float32))[None]
+        out = torch.nn.functional.pixel_shuffle(DESIGN.forward(parts, x), 2)[0].numpy()
+    choice = out[3:].argmax(0)
+    inside = np.s_[8:-8, 8:56], np.s_[8:-8, 72:120]
+    assert (choice[inside[0]] == 0).mean() > 0.9
+    assert (choice[inside[1]] == 1).mean() > 0.9
+    likely = np.exp(out[0])
+    assert np.median(likely[8:-8, 8:56]) == pytest.approx(0.013, rel=0.5)
+
+
+def test_a_choice_that_is_too_far_costs_most():
+    torch = pytest.importorskip('torch')
+    given = samples(np.random.default_rng(0))
+    x = torch.from_numpy(given.x.astype(np.float32))[None]
+    found = torch.from_numpy(given.found.astype(np.float32))[None]
+    one = torch.ones(1, 1, 128, 128)
+
+    def costs(true: float) -> float:
+        out = torch.zeros(1, len(DESIGN.begin), 64, 64)
+        out[:, :12] = np.log(0.01)
+        out[:, 12:16] = 20.0  # what was measured
+        return float(loss(out, x, found, true * one, one))
+    assert costs(0.0) < costs(-0.4) < costs(0.4) - 1.0
+
+
+def test_nothing_is_fitted_to_what_is_not_known():
+    pytest.importorskip('torch')
+    given = samples(np.random.default_rng(0))
+    with pytest.raises(ValueError, match='truth'):
+        fit([replace(given, weight=0 * given.weight)], 1, np.random.default_rng(0))
