@@ -48,10 +48,9 @@ _FRAMES = 14
 # What is rendered beside the tuning seeds.
 _JOBS = (('street', 12, None), ('street', 13, None), ('takeoff', 14, None),
          ('street', 16, 'traffic'), ('street', 17, None), ('street', 18, 'occlusion'),
-         ('street', 19, None), ('street', 22, None), ('takeoff', 26, None),
-         ('street', 24, 'low_light'), ('street', 27, None), ('street', 28, 'traffic'),
-         ('street', 29, None), ('corridor', 30, None), ('street', 31, 'exposure'),
-         ('street', 32, None), ('street', 33, 'wall'), ('street', 34, None))
+         ('street', 19, None), ('street', 22, None), ('street', 24, 'low_light'),
+         ('takeoff', 26, None))
+_HEIGHT = 960
 # Frames back of the references, the first frame that is measured, those that are kept, and whether
 # at half the size.
 _WINDOWS = (((1, 4, 7, 10), 4, (10, 12, 13), False), ((1,), 3, (6,), False),
@@ -168,8 +167,7 @@ def render(folder: Path) -> None:
     """Scenes beside those of the tuning seeds."""
     for name, seed, nuisance in tqdm(_JOBS, unit='scene'):
         if not (target := folder / f'{name}_{seed}').exists():
-            sequence = render_sequence(name, seed, _FRAMES, 480 if name == 'corridor' else 960,
-                                       nuisance=nuisance)
+            sequence = render_sequence(name, seed, _FRAMES, _HEIGHT, nuisance=nuisance)
             _save([sequence[k] for k in range(_FRAMES)], target, name)
 
 
