@@ -7,7 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sphstereo_ros.core import memory_judge
+from sphstereo_ros.core.frames import Frame, FrameKey, Reference, RelativePose
 from sphstereo_ros.core.inverse_range import NOTHING
+from sphstereo_ros.core.joint import Measurement
 from sphstereo_ros.core.memory_judge import (
     BLOCK,
     CHANNELS,
@@ -18,6 +20,7 @@ from sphstereo_ros.core.memory_judge import (
     judged,
     pixel_of,
 )
+from sphstereo_ros.core.range_memory import RangeMemory, Remembered
 from sphstereo_ros.core.reliability import LEAST, NEAR_BY
 
 HEIGHT = 32
@@ -193,3 +196,43 @@ def test_whatever_it_sees_what_it_tells_is_one_of_them(height, seed):
     assert ((rho == given.measured[0]) | old | both).all()
     assert ((sigma == NOTHING) | (sigma >= given.pose)).all()
     assert (sigma > 0).all()
+
+
+class Drives:
+    """A camera that hardly moves, and what it measures."""
+
+    BASELINE = 0.01  # m
+
+    def __init__(self) -> None:
+        self.memory, self.stamp = RangeMemory(0.45), 0
+
+    def sees(self, grey: np.ndarray | None, rho: float = MEASURED) -> Remembered:
+        """Tell the memory; grey : the view, or None where evidence alone decides."""
+        measured = Measurement(*(whole(v) for v in (rho, 0.01, rho)), whole(1, np.int8),
+                               whole(0.01), whole(0.003))
+        self.stamp += 33_333_333
+        before = FrameKey(self.stamp - 33_333_333, 'camera')
+        pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -self.BASELINE]))
+        return self.memory.fused(FrameKey(self.stamp, 'camera'),
+                                 (Reference(Frame(before, view()), pose),), measured, None, grey)
+
+
+def test_from_the_second_window_on_the_network_decides_what_is_told(monkeypatch):
+    monkeypatch.setattr(memory_judge, '_network', lambda: Tells(0.2, 0.05, (1, 0, 0)))
+    camera = Drives()
+    np.testing.assert_allclose(camera.sees(view()).sigma, 0.01, rtol=1e-6)
+    found = camera.sees(view(), 0.105)
+    np.testing.assert_allclose(found.rho, 0.105, rtol=1e-6)
+    np.testing.assert_allclose(found.sigma, 0.2 * pixel_of(HEIGHT, Drives.BASELINE), rtol=1e-3)
+
+
+def test_it_only_reads(monkeypatch):
+    """What was told has no part in what is remembered."""
+    monkeypatch.setattr(memory_judge, '_network', lambda: Tells(0.2, 0.05, (0, 9, 0)))
+    read, other = Drives(), Drives()
+    for rho in (0.1, 0.11, 0.1):
+        read.sees(view(), rho)
+        other.sees(None, rho)
+    found, wanted = read.sees(None), other.sees(None)
+    for name in ('rho', 'sigma', 'evidence'):
+        np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
