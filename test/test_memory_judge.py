@@ -120,12 +120,11 @@ def test_nothing_is_told_behind_what_the_newest_frame_sees_near_by(monkeypatch, 
     assert ((sigma < NOTHING) == known).all()
 
 
-@pytest.mark.parametrize(('baselines', 'known'), [(39, True), (41, False), (99, False),
-                                                  (101, True)])
-def test_how_sure_it_has_to_be_hangs_on_how_far_away_it_is(monkeypatch, baselines, known):
+@pytest.mark.parametrize(('baselines', 'likely', 'known'), [
+    (10, 0.27, True), (10, 0.29, False), (99, 0.29, False), (101, 0.44, True), (101, 0.46, False)])
+def test_how_sure_it_has_to_be_hangs_on_how_far_away_it_is(monkeypatch, baselines, likely, known):
     given = opinions()
     given.measured[0][:] = 1 / (baselines * BASELINES[0])
-    likely = 0.37 if baselines < 99.5 else 0.42
     _, sigma = told(monkeypatch, Tells(likely, 0.05, (1, 0, 0)), given)
     assert ((sigma < NOTHING) == known).all()
 

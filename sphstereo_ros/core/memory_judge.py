@@ -36,9 +36,9 @@ _APART = np.float32(2)  # logarithm by which inverse ranges differ at most, or s
 _EVIDENCE = np.float32(1 / 6)
 _LOGARITHMS = (*range(4), *range(4, 8), *range(16, 20), *range(28, 36), *range(44, 52), 57)
 _TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
-# Of the unit: errors that two thirds stay under where it is told, near by, farther, and beyond
-# _FAR shortest baselines; and what may be nearer with which nothing is told near by.
-_SURE_NEAR, _SURE, _SURE_FAR, _FAR, _NEARER = 0.4, 0.3, 0.45, 100.0, 0.4
+# Of the unit: errors that two thirds stay under where it is told, and beyond _FAR baselines;
+# and what may be nearer with which nothing is told near by.
+_SURE, _SURE_FAR, _FAR, _NEARER = 0.28, 0.45, 100.0, 0.4
 _BEFORE = 1.3  # times as far away as what the newest frame is believed to see near by
 
 
@@ -178,14 +178,6 @@ def _near_by(rho: np.float32, baseline: np.float32) -> bool:  # pragma: no cover
 
 
 @fast_kernel
-def _sure(rho: np.float32, baseline: np.float32) -> np.float32:  # pragma: no cover - compiled
-    """Share of the unit that two thirds of the errors have to stay under."""
-    if _near_by(rho, baseline):
-        return np.float32(_SURE_NEAR)
-    return np.float32(_SURE if rho * baseline * np.float32(_FAR) > 1 else _SURE_FAR)
-
-
-@fast_kernel
 def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tuple[Map, ...],
                 frames: Evidence, before: tuple[Map, ...], fused: tuple[Map, ...], pose: Map,
                 scale: Map, rho: Map, sigma: Map) -> None:  # pragma: no cover - compiled
@@ -205,7 +197,8 @@ def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tupl
                 measured[0][i, j] > np.float32(_BEFORE) * best)
             own = likely_error(told, 0, i, j, scale[2]) * unit
             rho[i, j], sigma[i, j] = best, nothing
-            sure = np.exp(told[0, i, j]) - least <= _sure(best, scale[1])
+            far = best * scale[1] * np.float32(_FAR) < 1
+            sure = np.exp(told[0, i, j]) - least <= np.float32(_SURE_FAR if far else _SURE)
             if sure and not hides and frames[i, j] >= 0:
                 sigma[i, j] = np.sqrt(own * own + pose[i, j] * pose[i, j])
 
