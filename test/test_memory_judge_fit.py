@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from test_memory_judge import AHEAD, BASELINES, HEIGHT, MEASURED, PIXEL, opinions, view
 
-from sphstereo_ros.bench.memory_judge import DESIGN, Patch, fit, loss, patch_of
-from sphstereo_ros.core.memory_judge import CHANNELS
-from sphstereo_ros.scenes.sequence import TruthFrame
+from sphstereo_ros.bench import memory_judge as bench
+from sphstereo_ros.bench.memory_judge import DESIGN, Patch, fit, loss, patch_of, patches_of
+from sphstereo_ros.core.memory_judge import CHANNELS, pixel_of
+from sphstereo_ros.scenes.sequence import TruthFrame, render_sequence, save_sequence
 
 
 def truth(distance: float, moving: bool = False) -> TruthFrame:
@@ -100,3 +101,21 @@ def test_nothing_is_fitted_to_what_is_not_known():
     given = samples(np.random.default_rng(0))
     with pytest.raises(ValueError, match='truth'):
         fit([replace(given, weight=0 * given.weight)], 1, np.random.default_rng(0))
+
+
+def test_the_patches_of_a_sequence_tell_its_truth(tmp_path, monkeypatch):
+    pytest.importorskip('trimesh')
+    rendered = render_sequence('street', 1, 5, 96)
+    save_sequence([rendered[k] for k in range(5)], tmp_path / 'street', 'street')
+    monkeypatch.setattr(bench, '_WINDOWS', (((1, 2), 2, (4,), False), ((1,), 3, (4,), True)))
+    whole, half = patches_of(tmp_path / 'street', np.random.default_rng(0))
+    assert whole.x.shape == (CHANNELS, 48, 96)
+    assert half.x.shape == (CHANNELS, 24, 48)
+    pixel = pixel_of(96, 2 * np.linalg.norm(rendered[4].position - rendered[3].position))
+    level = np.empty((96, 192))
+    for n in range(4):  # of four pixels each
+        level[n // 2::2, n % 2::2] = np.exp(whole.x[n].astype(float)) - 1
+    truth = np.exp(whole.true) * (level + 1) - 1
+    known = np.isfinite(rendered[4].range) & (rendered[4].range < 20)
+    np.testing.assert_allclose(truth[known] * pixel, 1 / rendered[4].range[known], rtol=0.05)
+    assert np.median(np.abs(whole.true[known])) < 0.1  # most was measured well

@@ -41,7 +41,7 @@ from sphstereo_ros.scenes.sequence import TruthFrame, load_sequence, render_sequ
 
 from .accuracy import as_frame
 from .reliability import MOST, PERCENTILES, disturbed
-from .surroundings import _save
+from .surroundings import save_scene
 from .unet import Design, Parameters, fit_arguments, percentile_loss, save_fit
 
 _FRAMES = 14
@@ -168,7 +168,7 @@ def render(folder: Path) -> None:
     for name, seed, nuisance in tqdm(_JOBS, unit='scene'):
         if not (target := folder / f'{name}_{seed}').exists():
             sequence = render_sequence(name, seed, _FRAMES, _HEIGHT, nuisance=nuisance)
-            _save([sequence[k] for k in range(_FRAMES)], target, name)
+            save_scene([sequence[k] for k in range(_FRAMES)], target, name)
 
 
 def loss(out: Any, x: Any, found: Any, true: Any, weight: Any) -> Any:

@@ -163,7 +163,7 @@ def render(folder: Path) -> None:
     _render_pairs(folder)
     for seed in tqdm(_HOLLOW_SEEDS, unit='hollow'):
         if not (target := folder / f'hollow_{seed}').exists():
-            _save(hollow(seed, _RENDERED, _STEP), target, 'hollow')
+            save_scene(hollow(seed, _RENDERED, _STEP), target, 'hollow')
 
 
 def _render_ways(folder: Path) -> None:
@@ -204,10 +204,11 @@ def render_way(folder: Path, name: str, seed: int, height: int, spacing: float |
     if target.exists():
         return
     sequence = render_sequence(name, seed, 14, height, spacing=spacing, nuisance=nuisance)
-    _save([sequence[k] for k in _RENDERED], target, name)
+    save_scene([sequence[k] for k in _RENDERED], target, name)
 
 
-def _save(frames: list[TruthFrame], target: Path, name: str) -> None:
+def save_scene(frames: list[TruthFrame], target: Path, name: str) -> None:
+    """Into a folder that is there only when it is whole."""
     save_sequence(frames, target.with_suffix('.part'), name)
     target.with_suffix('.part').rename(target)
 
