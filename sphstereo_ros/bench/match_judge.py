@@ -9,7 +9,6 @@ frames each; those of `sphstereo_ros.bench.surroundings` serve as well. `fit` ne
 """
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +30,7 @@ from .accuracy import as_frame
 from .processes import shipped
 from .reliability import MOST, PERCENTILES, disturbed, true_on_grid
 from .surroundings import render_way
-from .unet import Design, Parameters, fit_arguments, percentile_loss, save_fit
+from .unet import Design, Parameters, percentile_loss, render_or_fit
 
 _SEEDS = range(2000, 2203)
 _SCENES = ('street', 'street', 'takeoff', 'takeoff', 'street', 'corridor')  # how often each
@@ -156,15 +155,7 @@ def render(folder: Path) -> None:
 
 def main() -> None:
     """Render, or fit and save."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
-    commands = parser.add_subparsers(dest='command', required=True)
-    commands.add_parser('render').add_argument('folder', type=Path)
-    fit_arguments(commands.add_parser('fit'), 8000)
-    given = parser.parse_args()
-    if given.command == 'render':
-        render(given.folder)
-    else:
-        save_fit(given, DESIGN, Patch, patches_of, fit)
+    render_or_fit(__doc__, 8000, render, DESIGN, Patch, patches_of, fit)
 
 
 if __name__ == '__main__':

@@ -9,7 +9,6 @@ package itself does without.
 """
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,7 +47,7 @@ from sphstereo_ros.scenes.sequence import (
 from .accuracy import as_frame
 from .hollows import hollow
 from .reliability import MOST, PERCENTILES, Watched, disturbed
-from .unet import Design, Parameters, fit_arguments, percentile_loss, save_fit
+from .unet import Design, Parameters, known_truth, percentile_loss, render_or_fit
 
 _SEEDS, _PAIR_SEEDS, _SLOW_SEEDS, _HARD_SEEDS, _SMALL_SEEDS, _HOLLOW_SEEDS, _HARDER_SEEDS = (
     range(11, 61), range(61, 81), range(82, 98), range(121, 141), range(141, 185),
@@ -330,24 +329,14 @@ def fit(patches: Sequence[Patch], steps: int, rng: np.random.Generator,
 
     Raises ValueError where of no patch enough of the truth is known.
     """
-    known = [p for p in patches if p.weight.mean(dtype=np.float64) > _TRUE]
-    if not known:
-        raise ValueError('of no patch enough of the truth is known')
+    known = known_truth(patches, _TRUE)
     return DESIGN.fitted(lambda: _drawn(known, rng), loss, steps, _BATCH, start, _RATE,
                          bfloat16)
 
 
 def main() -> None:
     """Render, or fit and save."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
-    commands = parser.add_subparsers(dest='command', required=True)
-    commands.add_parser('render').add_argument('folder', type=Path)
-    fit_arguments(commands.add_parser('fit'), 6000)
-    given = parser.parse_args()
-    if given.command == 'render':
-        render(given.folder)
-    else:
-        save_fit(given, DESIGN, Patch, patches_of, fit)
+    render_or_fit(__doc__, 6000, render, DESIGN, Patch, patches_of, fit)
 
 
 if __name__ == '__main__':

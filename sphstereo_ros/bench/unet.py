@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 from zlib import crc32
 
 import numpy as np
@@ -204,6 +204,33 @@ def fit_arguments(parser: argparse.ArgumentParser, steps: int) -> None:
                         'fast where the CPU can')
     parser.add_argument('--patches', type=Path, metavar='DIR', help='keep what was measured here, '
                         'and find it the next time; read as it is needed, not held in memory')
+
+
+def known_truth(patches: Sequence[Patch], least: float) -> list[Patch]:
+    """Those of which so large a share of the truth is known, by their `weight`.
+
+    Raises ValueError where there is none.
+    """
+    known = [p for p in patches if cast(Any, p).weight.mean(dtype=np.float64) > least]
+    if not known:
+        raise ValueError('of no patch enough of the truth is known')
+    return known
+
+
+def render_or_fit(about: str | None, steps: int, render: Callable[[Path], None], design: Design,
+                  kind: Callable[..., Patch],
+                  patches_of: Callable[[Path, np.random.Generator], list[Patch]],
+                  fit: Callable[..., Parameters]) -> None:
+    """The commands of a network's module: `render FOLDER`, and `fit` as of `save_fit`."""
+    parser = argparse.ArgumentParser(description=about.splitlines()[0] if about else '')
+    commands = parser.add_subparsers(dest='command', required=True)
+    commands.add_parser('render').add_argument('folder', type=Path)
+    fit_arguments(commands.add_parser('fit'), steps)
+    given = parser.parse_args()
+    if given.command == 'render':
+        render(given.folder)
+    else:
+        save_fit(given, design, kind, patches_of, fit)
 
 
 def save_fit(given: argparse.Namespace, design: Design, kind: Callable[..., Patch],
