@@ -58,7 +58,7 @@ def judged_with(monkeypatch, likely: float, completed: float, nearer: float = 0.
     nowhere = (shift(baselines[0]) < 0.8) & ((nearer > 0.4) | (shift(baselines[1]) < 3))
     assert (judged.rho == RHO)[1::2, nowhere].all()
     return Judged(*(m[1::2, seen] for m in (judged.rho, judged.other, judged.error,
-                                            judged.frames)))
+                                            judged.frames)), wider=judged.wider[:, 1::2, seen])
 
 
 @pytest.mark.parametrize(('likely', 'completed', 'taken'), [
@@ -71,6 +71,19 @@ def test_the_likelier_stands(monkeypatch, likely, completed, taken):
         error = completed * np.maximum(GUESS, PIXEL / BASELINES[1])[SEEN]
         np.testing.assert_allclose(judged.error, np.broadcast_to(error, judged.rho.shape),
                                    rtol=0.05)
+
+
+@pytest.mark.parametrize('taken', [True, False])
+def test_what_is_passed_over_is_told_with_both_errors(monkeypatch, taken):
+    likely, completed, nearer = 0.5 if taken else 0.01, 0.02, 0.03
+    wider = judged_with(monkeypatch, likely, completed, nearer).wider
+    unit = np.maximum(GUESS, PIXEL / BASELINES[1])[SEEN]
+    of = ((RHO, RHO * np.full(3, likely)[:, None]),
+          (GUESS, unit * np.array([completed, completed, nearer])[:, None]))
+    (_, its), (other, others) = of[::-1] if taken else of
+    np.testing.assert_allclose(wider[3], other, rtol=1e-3)
+    np.testing.assert_allclose(wider[:3, 0], its + 0 * unit, rtol=1e-3)
+    np.testing.assert_allclose(wider[4:, 0], others + 0 * unit, rtol=1e-3)
 
 
 @pytest.mark.parametrize(('guess', 'taken'), [(0.98, False), (1.02, False), (0.94, True)])

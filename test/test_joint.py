@@ -53,11 +53,15 @@ def test_what_is_judged_is_what_is_measured(monkeypatch):
     _, view = seen()
     before = measured('joint', view)
     decide = joint.by_looks
+    wider = np.arange(1, 8, dtype=np.float32)[:, None, None]
     monkeypatch.setattr(joint, 'by_looks', lambda *given: replace(
-        decide(*given), rho=np.full_like(given[0].view, 0.25 * 0.3, np.float32)))
+        decide(*given), rho=np.full_like(given[0].view, 0.25 * 0.3, np.float32),
+        wider=np.broadcast_to(0.3 * wider, (7, *given[0].view.shape)).astype(np.float32)))
     found = measured('joint', view)
     assert np.ptp(before.rho) > 0.1
     np.testing.assert_allclose(found.rho, 0.25, rtol=1e-6)
+    np.testing.assert_allclose(found.wider, np.broadcast_to(wider, found.wider.shape), rtol=1e-6)
+    assert measured('joint_fast', view).wider is None
 
 
 def altered(view: PairedWindow, reference: Callable[[np.ndarray], np.ndarray],

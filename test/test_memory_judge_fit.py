@@ -5,7 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_memory_judge import AHEAD, BASELINES, HEIGHT, MEASURED, PIXEL, opinions, view
+from test_memory_judge import (
+    AHEAD,
+    BASELINES,
+    HEIGHT,
+    MEASURED,
+    PASSED_OVER,
+    PIXEL,
+    opinions,
+    view,
+)
 
 from sphstereo_ros.bench import memory_judge as bench
 from sphstereo_ros.bench.memory_judge import DESIGN, Patch, fit, loss, patch_of, patches_of
@@ -26,10 +35,12 @@ def patch(distance: float, moving: bool = False) -> Patch:
 
 def test_a_patch_tells_how_far_each_is_from_the_truth():
     found = patch(8.0)
-    true, old, both = ((rho + PIXEL) / (MEASURED + PIXEL) for rho in (1 / 8, 0.08, 0.09))
+    true, old, both, other = ((rho + PIXEL) / (MEASURED + PIXEL)
+                              for rho in (1 / 8, 0.08, 0.09, PASSED_OVER))
     np.testing.assert_allclose(found.true, np.log(true), atol=1e-3)
     np.testing.assert_allclose(found.found[0], np.log(old), atol=1e-3)
     np.testing.assert_allclose(found.found[1], np.log(both), atol=1e-3)
+    np.testing.assert_allclose(found.found[2], np.log(other), atol=1e-3)
     assert found.x.shape == (CHANNELS, HEIGHT // 2, HEIGHT)
 
 
@@ -58,7 +69,7 @@ def samples(rng: np.random.Generator) -> Patch:
     x[0:4], x[20:24] = 3.0, 0.0
     x[20:24, :, 32:] = 1.0
     right = np.broadcast_to(np.arange(128) >= 64, (128, 128))
-    found = np.stack([np.full((128, 128), -0.4), np.full((128, 128), -0.2)])
+    found = np.stack([np.full((128, 128), off) for off in (-0.4, -0.2, 0.3)])
     true = np.where(right, -0.4, 0.0) + rng.normal(0, 0.01, (128, 128))
     maps = [m.astype(np.float16) for m in (found, true, np.ones((128, 128)))]
     return Patch(x.astype(np.float16), *maps)

@@ -66,20 +66,23 @@ _TRUE = 0.02  # share of a sample of which the truth has to be known
 _WRONG, _FARTHER, _WORSE, _CHOICE = 0.5, 0.35, 0.3, 4.0
 _POSES, _POSE = 0.3, 0.05  # share of samples of which poses are unsure, and by how much
 
-_OF_ERROR, _CHOSEN = len(PERCENTILES), 3
+_OFF, _RARELY = 0.1, -2.0  # share of the inverse range by which it is off, and a logit to begin
+
+_OF_ERROR, _CHOSEN = len(PERCENTILES), 4
 DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
-                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * (4 * (_CHOSEN - 1)) + [1.0] * 4, deep=True)
+                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * 8 + [1.0] * 4 + [0.0] * 4 + [_RARELY] * 4,
+                deep=True)
 
 
 @dataclass(frozen=True)
 class Patch:
     """What the network sees of a frame and should tell.
 
-    x : float16 (CHANNELS, rows, columns); found, true : float16 (2, 2 rows, 2 columns) and (2
+    x : float16 (CHANNELS, rows, columns); found, true : float16 (3, 2 rows, 2 columns) and (2
     rows, 2 columns), logarithms of how many times as large as measured the inverse range is that
-    was remembered, that both are as one, and the true one, a pixel of the longest baseline's
-    parallax added to each; weight : the same, 0 where the truth is unknown, or moves and is found
-    too near
+    was remembered, that both are as one, that was passed over, and the true one, a pixel of the
+    longest baseline's parallax added to each; weight : the same, 0 where the truth is unknown, or
+    moves and is found too near
     """
 
     x: NDArray[np.float16]
@@ -99,8 +102,9 @@ def patch_of(truth: TruthFrame, view: Image8, opinions: Opinions, direction: NDA
     def against(rho: Map, where: Any = True) -> Map:
         found = np.log((np.maximum(rho, 0) + pixel) / (np.maximum(measured, 0) + pixel))
         return np.asarray(np.where(where, found, 0), np.float32)
-    before, fused = (against(rho, sigma < NOTHING)
-                     for rho, sigma, *_ in (opinions.before, opinions.fused))
+    found = [against(rho, sigma < NOTHING)
+             for rho, sigma, *_ in (opinions.before, opinions.fused)]
+    found.append(against(opinions.wider[3]))
     wanted = against(np.nan_to_num(true))
     weight = np.isfinite(true) * _areas(height)
     if truth.moving is not None:  # what moves seems near or far by its speed
@@ -108,7 +112,7 @@ def patch_of(truth: TruthFrame, view: Image8, opinions: Opinions, direction: NDA
     weight *= np.where((true > 0.01) & (true < 0.1), _RARE, 1)
     weight *= np.where((true > 0.01) & (true < 1 / 30), _RARER, 1)
     weight *= np.where((true > 0.1) & (wanted > np.log(1.5)), _TOO_FAR, 1)
-    return Patch(x.astype(np.float16), np.stack([before, fused]).astype(np.float16),
+    return Patch(x.astype(np.float16), np.stack(found).astype(np.float16),
                  wanted.astype(np.float16), weight.astype(np.float16))
 
 
@@ -171,7 +175,7 @@ def render(folder: Path) -> None:
 
 
 def loss(out: Any, x: Any, found: Any, true: Any, weight: Any) -> Any:
-    """Of the percentiles of what is chosen, and of the choice."""
+    """Of the percentiles of what is chosen, of how probably it is off, and of the choice."""
     import torch
     from torch.nn import functional
     told = functional.pixel_shuffle(out, 2)
@@ -179,12 +183,14 @@ def loss(out: Any, x: Any, found: Any, true: Any, weight: Any) -> Any:
     each = torch.cat([torch.zeros_like(true), found], 1)
     nearer = true - each
     wrong = nearer.abs().clamp(max=_WRONG) + _WORSE * (nearer > _FARTHER)
-    choices = told[:, _OF_ERROR:]
+    choices, doubt = told[:, _OF_ERROR:_OF_ERROR + _CHOSEN], told[:, _OF_ERROR + _CHOSEN:]
     chosen = (torch.softmax(choices, 1) * wrong).sum(1, keepdim=True)
     likeliest = torch.exp(level + each.gather(1, choices.argmax(1, keepdim=True))) - 1
     off = (torch.exp(level + true) - 1 - likeliest) / likeliest.clamp(min=1)
+    doubted = functional.binary_cross_entropy_with_logits(
+        doubt, (off.abs() > _OFF).float(), reduction='none')
     return (percentile_loss(told[:, :_OF_ERROR], off, weight, LEAST, MOST, PERCENTILES)
-            + _CHOICE * (weight * chosen).sum() / weight.sum())
+            + (weight * (_CHOICE * chosen + doubted)).sum() / weight.sum())
 
 
 def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, ...]:

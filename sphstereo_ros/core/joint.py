@@ -54,6 +54,7 @@ class Measurement:
     told : standard deviation by what the grey tells alone, if nothing misleads it
     pose : the pose's share of sigma
     moving : uint8 (H // 2, 2 * (H // 2)), 255 = leaves its meridian; None if that was not measured
+    wider : float32 (7, H, 2H), what is told by what is round about, as `Judged.wider`
     """
 
     rho: Map
@@ -63,6 +64,7 @@ class Measurement:
     told: Map
     pose: Map
     moving: Image8 | None = None
+    wider: NDArray[np.float32] | None = None
 
 
 def in_steps(pose: RelativePose) -> RelativePose:
@@ -143,9 +145,10 @@ def filled(rho: Map) -> Map:
 @kernel
 def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map, sin_lon: Map,
                   axes: Map, at_pole: Map, rho: Map, error: Map, frames: Evidence, other: Map,
-                  baselines: Map, ways: Map, pose: Map, told: Map, per_unit: np.float32,
-                  out: Map, sigma_out: Map, other_out: Map, frames_out: Evidence,
-                  told_out: Map, pose_out: Map) -> None:  # pragma: no cover - compiled
+                  baselines: Map, ways: Map, pose: Map, told: Map, wider: NDArray[np.float32],
+                  per_unit: np.float32, out: Map, sigma_out: Map, other_out: Map,
+                  frames_out: Evidence, told_out: Map, pose_out: Map,
+                  wider_out: NDArray[np.float32]) -> None:  # pragma: no cover - compiled
     """Sample the polar grid; σ of every pixel, with the pose's share.
 
     at_pole : column of the pole, row of the azimuth 0, rad of a pixel, px that no match beats;
@@ -187,6 +190,8 @@ def _measure_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Ma
             told_out[i, j] = told[rn, cn] * per_unit
             pose_out[i, j] = min(per_unit * np.sqrt(by_angle * by_angle + by_pose * by_pose),
                                  nothing)
+            for n in range(wider.shape[0]):
+                wider_out[n, i, j] = wider[n, rn, cn] * per_unit
 
 
 def _scaled(most: int, least: int, height: int) -> int:
@@ -297,8 +302,12 @@ class JointMatcher:
         poses[poses[:, 2] == 0, 2] = self._baseline_sigma
         baselines = np.array([p.baseline for _, p in pairs], np.float32)
         ways = np.array([p.direction for _, p in pairs], np.float32)
+        wider = judged.wider
+        around = np.empty((0 if wider is None else len(wider), *rho.shape), np.float32)
         rows_in_parallel(_measure_rows, height, *_grid_angles(height),
                          np.ascontiguousarray(axes, np.float32), at_pole, judged.rho,
                          judged.error, judged.frames, judged.other, baselines, ways, poses, noise,
-                         np.float32(1 / unit), rho, sigma, second, frames, told, pose)
-        return Measurement(rho, sigma, second, frames, told, pose)
+                         np.empty((0, 0, 0), np.float32) if wider is None else wider,
+                         np.float32(1 / unit), rho, sigma, second, frames, told, pose, around)
+        return Measurement(rho, sigma, second, frames, told, pose,
+                           wider=None if wider is None else around)

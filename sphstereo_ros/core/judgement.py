@@ -14,12 +14,13 @@ from .jit import fast_kernel, rows_in_parallel
 from .match_judge import CONTRADICTS, likely_error, shows_the_same
 from .matching import Parallax
 from .refinement import Refined
-from .reliability import NEAR_BY, expected_error, look, may_be_near, network, percentiles
+from .reliability import LEAST, NEAR_BY, expected_error, look, may_be_near, network, percentiles
 from .surroundings import inputs, judged, likeliest
 from .sweep import reduction
 from .warp import Map, PolarGrid, _arctan2
 
 Evidence = NDArray[np.int8]
+WIDER = 7  # maps of `Judged.wider`
 
 MISFIT = 150.0  # squared grey levels, beyond which no reference shows the same
 # Of the unit: a likely error with which something counts as measured, by what pixels tell
@@ -72,6 +73,9 @@ class Judged:
     frames : for how many frames of evidence it counts; 0 = it is not believed, −1 = nor should
     be what is remembered there
     floor : px that no match beats, if the error does not tell them
+    wider : float32 (WIDER, …), 1/m, what is told by what is round about: the 68th and 95th
+    percentile of the error of `rho`, and the 98th of how much nearer the truth may be; what was
+    passed over, measured or completed, and its three; None if it was not asked
     """
 
     rho: Map
@@ -79,6 +83,7 @@ class Judged:
     error: Map
     frames: Evidence
     floor: float = 0.0
+    wider: NDArray[np.float32] | None = None
 
 
 def by_looks(found: Found, others: Alternatives, grid: PolarGrid,
@@ -105,7 +110,9 @@ def by_looks(found: Found, others: Alternatives, grid: PolarGrid,
     theta = grid.theta().astype(np.float32)
     rows_in_parallel(_complete_rows, len(rho), found.now, found.before, wider[5:8], *guess,
                      _share_round(sure, grid), theta, scale, rho, error, frames)
-    return Judged(rho, found.other, error, frames)
+    both = np.empty((WIDER, *rho.shape), np.float32)
+    rows_in_parallel(_wider_rows, len(rho), wider, rho, found.refined.rho, unit, *guess, both)
+    return Judged(rho, found.other, error, frames, wider=both)
 
 
 def _share_round(sure: NDArray[np.bool_], grid: PolarGrid) -> Map:
@@ -155,6 +162,23 @@ def _complete_rows(first: int, last: int, view: Image8, before: Image8,
                     view, before, i, j, pixels, _CONTRADICTS if plainly else CONTRADICTS):
                 continue
             rho[i, j], error[i, j], frames[i, j] = there, spread, np.int8(1)
+
+
+@fast_kernel
+def _wider_rows(first: int, last: int, told: NDArray[np.float32], rho: Map, measured: Map,
+                unit: Map, guess: Map, its_unit: Map,
+                out: NDArray[np.float32]) -> None:  # pragma: no cover - compiled
+    """`Judged.wider`, of what was measured, or completed where `rho` is something else."""
+    for i in range(first, last):
+        for j in range(rho.shape[1]):
+            kept = rho[i, j] == measured[i, j]
+            one, other = (0, 5) if kept else (5, 0)
+            per = unit[i, j] if kept else its_unit[i, j]
+            per_other = its_unit[i, j] if kept else unit[i, j]
+            out[3, i, j] = guess[i, j] if kept else measured[i, j]
+            for k in range(3):
+                out[k, i, j] = per * (np.exp(told[one + k, i, j]) - np.float32(LEAST))
+                out[4 + k, i, j] = per_other * (np.exp(told[other + k, i, j]) - np.float32(LEAST))
 
 
 def together(own: NDArray[np.float32], wider: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -25,20 +25,24 @@ from .match_judge import likely_error
 from .reliability import LEAST, NEAR_BY, logarithms
 from .warp import Map
 
-_EACH = 14  # inputs of each pixel
+_EACH = 21  # inputs of each pixel
 CHANNELS = 4 * _EACH + 2  # and of each four
 LEVEL, SIGMAS, VIEW = 0, (4, 32, 48), 20  # inputs: where those of four pixels begin
-_TOLD = 6  # outputs for each pixel
+_TOLD = 8  # outputs for each pixel
 BLOCK = 8  # px at half size: what the network halves three times
 ROUND = 16  # px at half size that it sees beyond the seam
 _LEAST, _MOST = np.float32(1e-3), np.float32(10)  # shares that sigma counts for
 _APART = np.float32(2)  # logarithm by which inverse ranges differ at most, or share
 _EVIDENCE = np.float32(1 / 6)
-_LOGARITHMS = (*range(4), *range(4, 8), *range(16, 20), *range(28, 36), *range(44, 52), 57)
+_LOGARITHMS = (*range(8), *range(16, 20), *range(28, 36), *range(44, 52), *range(56, 84), 85)
+_DIFFERENCES = (*range(28, 32), *range(44, 48), *range(68, 72))
 _TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
-# Of the unit: errors that two thirds stay under where it is told, and beyond _FAR baselines;
-# and what may be nearer with which nothing is told near by.
-_SURE, _SURE_FAR, _FAR, _NEARER = 0.28, 0.45, 100.0, 0.4
+# Probabilities of being off by over a tenth with which it is told: near by, farther away, and
+# far away. And the share by which something may be nearer with which nothing is told near by.
+_OFF, _OFF_FARTHER, _OFF_FAR, _NEARER = 0.55, 0.65, 0.85, 0.7
+_FAR = 100.0  # shortest baselines
+# However slowly the camera moves, what is nearer than that is near by, or not far away: m.
+_NEAR_M, _FAR_M = 10.0, 30.0
 _BEFORE = 1.3  # times as far away as what the newest frame is believed to see near by
 
 
@@ -47,12 +51,12 @@ class Opinions:
     """What there is to choose from, float32 (H, 2H); inverse ranges and standard deviations, 1/m.
 
     measured : inverse range, sigma, second opinion, and sigma by what the grey tells alone, of the
-    newest frame; frames : for how many frames of evidence it counts, −1 = something may be much
-    nearer, and nothing is told
+    newest frame; frames : for how many frames of evidence it counts, as `Judged.frames`
     before : inverse range, sigma (NOTHING where unknown) and evidence of what was remembered, and
     how much its errors are like those of the newest frame
     fused : inverse range, sigma and evidence of both as one
     pose : the pose's share of sigma
+    wider : (7, H, 2H), as `Judged.wider`, of what was measured
     """
 
     measured: tuple[Map, Map, Map, Map]
@@ -60,6 +64,7 @@ class Opinions:
     before: tuple[Map, Map, Map, Map]
     fused: tuple[Map, Map, Map]
     pose: Map
+    wider: NDArray[np.float32]
 
 
 @fast_kernel
@@ -76,8 +81,8 @@ def _differs(rho: np.float32, level: np.float32,
 
 @fast_kernel
 def _input(view: Image8, measured: tuple[Map, ...], frames: Evidence, before: tuple[Map, ...],
-           fused: tuple[Map, ...], pixel: np.float32, r: int, c: int, n: int, x: Map,
-           p: int) -> None:  # pragma: no cover - compiled
+           fused: tuple[Map, ...], wider: NDArray[np.float32], pixel: np.float32, r: int, c: int,
+           n: int, x: Map, p: int) -> None:  # pragma: no cover - compiled
     """Column p of `x`, of pixel (r, c), the n-th of its four, before logarithms."""
     one, nothing = np.float32(1), np.float32(NOTHING)
     rho, old, both = measured[0][r, c], before[0][r, c], fused[0][r, c]
@@ -99,11 +104,17 @@ def _input(view: Image8, measured: tuple[Map, ...], frames: Evidence, before: tu
     x[44 + n, p] = _differs(both, level, pixel) if known else one
     x[48 + n, p] = _share(fused[1][r, c], max(both, pixel))
     x[52 + n, p] = _EVIDENCE * max(fused[2][r, c], np.float32(0))
+    other = wider[3, r, c]
+    x[68 + n, p] = _differs(other, level, pixel)
+    for k in range(3):
+        x[56 + 4 * k + n, p] = _share(wider[k, r, c], unit)
+        x[72 + 4 * k + n, p] = _share(wider[4 + k, r, c], max(other, pixel))
 
 
 @fast_kernel
 def _input_rows(first: int, last: int, view: Image8, measured: tuple[Map, ...], frames: Evidence,
-                before: tuple[Map, ...], fused: tuple[Map, ...], sine: Map, scale: Map,
+                before: tuple[Map, ...], fused: tuple[Map, ...], wider: NDArray[np.float32],
+                sine: Map, scale: Map,
                 out: NDArray[np.float32]) -> None:  # pragma: no cover - compiled
     """Rows of `out` (1, CHANNELS, …): on round the sphere, at the end as the last."""
     height, width = view.shape
@@ -114,13 +125,12 @@ def _input_rows(first: int, last: int, view: Image8, measured: tuple[Map, ...], 
                 for n in range(4):
                     r = min(2 * i + (n >> 1), height - 1)
                     c = (2 * (start + p - ROUND) + (n & 1)) % width
-                    _input(view, measured, frames, before, fused, scale[0], r, c, n, x, p)
-                    x[56, p], x[57, p] = sine[r, c], scale[1]
+                    _input(view, measured, frames, before, fused, wider, scale[0], r, c, n, x, p)
+                    x[84, p], x[85, p] = sine[r, c], scale[1]
             logarithms(x, _LOGARITHMS)
-            for k in range(28, 32):
+            for k in _DIFFERENCES:
                 for p in range(BLOCK):
                     x[k, p] = min(max(x[k, p], -_APART), _APART)
-                    x[k + 16, p] = min(max(x[k + 16, p], -_APART), _APART)
             for k in range(CHANNELS):
                 for p in range(BLOCK):
                     out[0, k, i, start + p] = x[k, p]
@@ -158,7 +168,8 @@ def inputs(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
     shortest, longest = baselines
     scale = np.array([pixel_of(height, longest), shortest / longest], np.float32)
     rows_in_parallel(_input_rows, size[0], view, opinions.measured, opinions.frames,
-                     opinions.before, opinions.fused, _sine(height, direction), scale, out)
+                     opinions.before, opinions.fused, opinions.wider, _sine(height, direction),
+                     scale, out)
     return out
 
 
@@ -174,22 +185,42 @@ def _network() -> Convolutions:
 
 @fast_kernel
 def _near_by(rho: np.float32, baseline: np.float32) -> bool:  # pragma: no cover - compiled
-    return bool(rho * baseline * np.float32(NEAR_BY) > 1)
+    return bool(rho * max(baseline * np.float32(NEAR_BY), np.float32(_NEAR_M)) > 1)
+
+
+@fast_kernel
+def _bound(rho: np.float32, baseline: np.float32,
+           bounds: Map) -> np.float32:  # pragma: no cover - compiled
+    if _near_by(rho, baseline):
+        return np.float32(bounds[0])
+    far = rho * max(baseline * np.float32(_FAR), np.float32(_FAR_M)) < 1
+    return np.float32(bounds[2] if far else bounds[1])
+
+
+@fast_kernel
+def _chosen(told: NDArray[np.float32], measured: Map, before: tuple[Map, ...],
+            fused: tuple[Map, ...], other: Map, i: int,
+            j: int) -> np.float32:  # pragma: no cover - compiled
+    best, most, nothing = measured[i, j], told[3, i, j], np.float32(NOTHING)
+    if before[1][i, j] < nothing and told[4, i, j] > most:
+        best, most = before[0][i, j], told[4, i, j]
+    if fused[1][i, j] < nothing and told[5, i, j] > most:
+        best, most = fused[0][i, j], told[5, i, j]
+    return np.float32(other[i, j] if told[6, i, j] > most else best)
 
 
 @fast_kernel
 def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tuple[Map, ...],
-                frames: Evidence, before: tuple[Map, ...], fused: tuple[Map, ...], pose: Map,
-                scale: Map, rho: Map, sigma: Map) -> None:  # pragma: no cover - compiled
-    """scale : inverse range of a pixel, shortest baseline, share of the 95th percentile"""
+                frames: Evidence, before: tuple[Map, ...], fused: tuple[Map, ...],
+                other: Map, pose: Map, scale: Map, bounds: Map, rho: Map,
+                sigma: Map) -> None:  # pragma: no cover - compiled
+    """scale : inverse range of a pixel, shortest baseline, share of the 95th percentile; bounds :
+    logits of being off, as of _OFF
+    """
     nothing, least, pixel = np.float32(NOTHING), np.float32(LEAST), scale[0]
     for i in range(first, last):
         for j in range(rho.shape[1]):
-            best, most = measured[0][i, j], told[3, i, j]
-            if before[1][i, j] < nothing and told[4, i, j] > most:
-                best, most = before[0][i, j], told[4, i, j]
-            if fused[1][i, j] < nothing and told[5, i, j] > most:
-                best = fused[0][i, j]
+            best = _chosen(told, measured[0], before, fused, other, i, j)
             unit = max(best, pixel)
             nearer = np.exp(told[2, i, j]) - least
             hides = nearer > np.float32(_NEARER) and _near_by(best + nearer * unit, scale[1])
@@ -197,17 +228,21 @@ def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tupl
                 measured[0][i, j] > np.float32(_BEFORE) * best)
             own = likely_error(told, 0, i, j, scale[2]) * unit
             rho[i, j], sigma[i, j] = best, nothing
-            far = best * scale[1] * np.float32(_FAR) < 1
-            sure = np.exp(told[0, i, j]) - least <= np.float32(_SURE_FAR if far else _SURE)
-            if sure and not hides and frames[i, j] >= 0:
+            if told[7, i, j] <= _bound(best, scale[1], bounds) and not hides:
                 sigma[i, j] = np.sqrt(own * own + pose[i, j] * pose[i, j])
 
 
+def _logits(*probabilities: float) -> Map:
+    given = np.array(probabilities)
+    return np.asarray(np.log(given / (1 - given)), np.float32)
+
+
 def told(x: NDArray[np.float32], height: int) -> NDArray[np.float32]:
-    """The network's outputs, float32 (6, H, 2H): logarithms of the 68th and 95th percentile of the
+    """The network's outputs, float32 (8, H, 2H): logarithms of the 68th and 95th percentile of the
     error of what is chosen and of the 98th of how much nearer the truth may be, as shares of the
-    inverse range (at least of `pixel_of`), with LEAST added; and three by which what was measured,
-    remembered, or both as one is chosen.
+    inverse range (at least of `pixel_of`), with LEAST added; four by which what was measured,
+    remembered, both as one, or what was passed over is chosen; and the
+    logit of the probability that it is off by over a tenth of its inverse range.
     """
     whole = of_each_pixel(interior(_network()(x), height), _TOLD)
     return np.ascontiguousarray(whole[:, :height])
@@ -223,5 +258,6 @@ def judged(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
     rho, sigma = np.empty((2, *view.shape), np.float32)
     scale = np.array([pixel_of(len(view), baselines[1]), baselines[0], np.exp(-_TAIL)], np.float32)
     rows_in_parallel(_judge_rows, len(rho), outputs, opinions.measured, opinions.frames,
-                     opinions.before, opinions.fused, opinions.pose, scale, rho, sigma)
+                     opinions.before, opinions.fused, opinions.wider[3], opinions.pose, scale,
+                     _logits(_OFF, _OFF_FARTHER, _OFF_FAR), rho, sigma)
     return rho, sigma

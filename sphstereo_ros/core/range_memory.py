@@ -202,9 +202,9 @@ class RangeMemory:
                          alike, moved.rho, moved.sigma, moved.evidence)
         self._key, self._kept, self._metric = key, moved, metric
         self._frames += 1
-        if view is not None and self._frames > 1:
+        if view is not None and new.wider is not None and self._frames > 1:
             opinions = Opinions((new.rho, new.sigma, new.other, new.told), frames, before,
-                                (moved.rho, moved.sigma, moved.evidence), new.pose)
+                                (moved.rho, moved.sigma, moved.evidence), new.pose, new.wider)
             return Remembered(*self._judged(view, opinions, references), moved.evidence)
         enough = (moved.evidence >= min(self._frames, _PUBLISHED)) & (frames >= 0)
         shortest = min(in_steps(r.pose).baseline for r in references)
