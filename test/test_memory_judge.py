@@ -109,6 +109,22 @@ def test_where_something_may_be_much_nearer_nothing_is_told_near_by(monkeypatch,
     assert ((sigma == NOTHING) == near).all()
 
 
+def test_where_the_newest_frame_may_hide_something_near_nothing_is_told(monkeypatch):
+    given = opinions()
+    given.frames[4, 7] = -1
+    _, sigma = told(monkeypatch, Tells(0.1, (0, 0, 1)), given)
+    assert np.argwhere(sigma == NOTHING).tolist() == [[4, 7]]
+
+
+@pytest.mark.parametrize(('rho', 'off', 'known'), [
+    (0.0, 0.11, False), (0.0, 0.09, True), (0.0099, 0.11, False), (0.0101, 0.84, True)])
+def test_what_would_be_told_to_be_free_has_to_be_sure(monkeypatch, rho, off, known):
+    given = opinions()
+    given.measured[0][:] = rho
+    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), off=off), given)
+    assert ((sigma < NOTHING) == known).all()
+
+
 @pytest.mark.parametrize(('ratio', 'frames', 'known'), [
     (1.4, 1, False), (1.2, 1, True), (1.4, 0, True)])
 def test_nothing_is_told_behind_what_the_newest_frame_sees_near_by(monkeypatch, ratio, frames,

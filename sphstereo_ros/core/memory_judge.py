@@ -37,12 +37,14 @@ _EVIDENCE = np.float32(1 / 6)
 _LOGARITHMS = (*range(8), *range(16, 20), *range(28, 36), *range(44, 52), *range(56, 84), 85)
 _DIFFERENCES = (*range(28, 32), *range(44, 48), *range(68, 72))
 _TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
-# Probabilities of being off by over a tenth with which it is told: near by, farther away, and
-# far away. And the share by which something may be nearer with which nothing is told near by.
-_OFF, _OFF_FARTHER, _OFF_FAR, _NEARER = 0.55, 0.65, 0.85, 0.7
+# Probabilities of being off by over a tenth with which it is told: near by, farther away, far
+# away, and where it would be told to be free.
+_OFF, _OFF_FARTHER, _OFF_FAR, _OFF_BEYOND = 0.55, 0.65, 0.85, 0.1
+_NEARER = 0.5  # share by which something may be nearer with which nothing is told near by
 _FAR = 100.0  # shortest baselines
-# However slowly the camera moves, what is nearer than that is near by, or not far away: m.
-_NEAR_M, _FAR_M = 10.0, 30.0
+# However slowly the camera moves, what is nearer than that is near by, or not far away; and what is
+# farther may be told to be free: m.
+_NEAR_M, _FAR_M, _FREE_M = 10.0, 30.0, 100.0
 _BEFORE = 1.3  # times as far away as what the newest frame is believed to see near by
 
 
@@ -51,7 +53,8 @@ class Opinions:
     """What there is to choose from, float32 (H, 2H); inverse ranges and standard deviations, 1/m.
 
     measured : inverse range, sigma, second opinion, and sigma by what the grey tells alone, of the
-    newest frame; frames : for how many frames of evidence it counts, as `Judged.frames`
+    newest frame; frames : for how many frames of evidence it counts, −1 = something may be much
+    nearer, and nothing is told
     before : inverse range, sigma (NOTHING where unknown) and evidence of what was remembered, and
     how much its errors are like those of the newest frame
     fused : inverse range, sigma and evidence of both as one
@@ -193,6 +196,8 @@ def _bound(rho: np.float32, baseline: np.float32,
            bounds: Map) -> np.float32:  # pragma: no cover - compiled
     if _near_by(rho, baseline):
         return np.float32(bounds[0])
+    if rho * np.float32(_FREE_M) < 1:
+        return np.float32(bounds[3])
     far = rho * max(baseline * np.float32(_FAR), np.float32(_FAR_M)) < 1
     return np.float32(bounds[2] if far else bounds[1])
 
@@ -228,7 +233,8 @@ def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tupl
                 measured[0][i, j] > np.float32(_BEFORE) * best)
             own = likely_error(told, 0, i, j, scale[2]) * unit
             rho[i, j], sigma[i, j] = best, nothing
-            if told[7, i, j] <= _bound(best, scale[1], bounds) and not hides:
+            sure = told[7, i, j] <= _bound(best, scale[1], bounds)
+            if sure and not hides and frames[i, j] >= 0:
                 sigma[i, j] = np.sqrt(own * own + pose[i, j] * pose[i, j])
 
 
@@ -259,5 +265,5 @@ def judged(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
     scale = np.array([pixel_of(len(view), baselines[1]), baselines[0], np.exp(-_TAIL)], np.float32)
     rows_in_parallel(_judge_rows, len(rho), outputs, opinions.measured, opinions.frames,
                      opinions.before, opinions.fused, opinions.wider[3], opinions.pose, scale,
-                     _logits(_OFF, _OFF_FARTHER, _OFF_FAR), rho, sigma)
+                     _logits(_OFF, _OFF_FARTHER, _OFF_FAR, _OFF_BEYOND), rho, sigma)
     return rho, sigma
