@@ -42,8 +42,8 @@ _TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile ma
 _OFF, _OFF_FARTHER, _OFF_FAR, _OFF_BEYOND = 0.55, 0.65, 0.85, 0.1
 _NEARER = 0.5  # share by which something may be nearer with which nothing is told near by
 _FAR = 100.0  # shortest baselines
-# However slowly the camera moves, what is nearer than that is near by, or not far away; and what is
-# farther may be told to be free: m.
+# However slowly the camera moves, what is nearer than that is near by, or not far away; and what
+# is farther may be told to be free: m.
 _NEAR_M, _FAR_M, _FREE_M = 10.0, 30.0, 100.0
 _BEFORE = 1.3  # times as far away as what the newest frame is believed to see near by
 
