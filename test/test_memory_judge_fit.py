@@ -69,8 +69,8 @@ def samples(rng: np.random.Generator) -> Patch:
     x[0:4], x[20:24] = 3.0, 0.0
     x[20:24, :, 32:] = 1.0
     right = np.broadcast_to(np.arange(128) >= 64, (128, 128))
-    found = np.stack([np.full((128, 128), off) for off in (-0.4, -0.2, 0.3)])
-    true = np.where(right, -0.4, 0.0) + rng.normal(0, 0.01, (128, 128))
+    found = np.stack([np.full((128, 128), off) for off in (-0.3, 0.3, 0.4)])
+    true = np.where(right, -0.3, 0.0) + rng.normal(0, 0.01, (128, 128))
     maps = [m.astype(np.float16) for m in (found, true, np.ones((128, 128)))]
     return Patch(x.astype(np.float16), *maps)
 
@@ -80,7 +80,7 @@ def test_a_fit_chooses_and_tells_the_error():
     pytest.importorskip('onnx')
     rng = np.random.default_rng(0)
     given = samples(rng)
-    parts = fit([given], 200, rng)
+    parts = fit([given], 400, rng)
     with torch.no_grad():
         x = torch.from_numpy(given.x.astype(np.float32))[None]
         out = torch.nn.functional.pixel_shuffle(DESIGN.forward(parts, x), 2)[0].numpy()

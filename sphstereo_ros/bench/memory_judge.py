@@ -59,7 +59,7 @@ _WINDOWS = (((1, 4, 7, 10), 4, (10, 12, 13), False), ((1,), 3, (6,), False),
 _RARE, _RARER, _TOO_FAR = 2.0, 1.5, 2.0
 _WIDTHS, _LAST = (24, 32, 48, 64), 24
 _BEGIN = -2.3  # logarithm of the error that it starts from
-_ROWS, _COLUMNS, _BATCH, _RATE = 160, 240, 3, 3e-3
+_ROWS, _COLUMNS, _BATCH, _RATE = 160, 240, 3, 1.5e-3
 _TRUE = 0.02  # share of a sample of which the truth has to be known
 # Of what is chosen: the logarithm of its error counts up to _WRONG; so much more where it is
 # farther than the truth by more than such a logarithm; and how much all that counts.
@@ -70,7 +70,7 @@ _OFF, _RARELY = 0.1, -2.0  # share of the inverse range by which it is off, and 
 
 _OF_ERROR, _CHOSEN = len(PERCENTILES), 4
 DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
-                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * 8 + [1.0] * 4 + [0.0] * 4 + [_RARELY] * 4,
+                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * (4 * _CHOSEN) + [_RARELY] * 4,
                 deep=True)
 
 

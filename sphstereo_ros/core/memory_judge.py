@@ -39,7 +39,7 @@ _DIFFERENCES = (*range(28, 32), *range(44, 48), *range(68, 72))
 _TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
 # Probabilities of being off by over a tenth with which it is told: near by, farther away, far
 # away, and where it would be told to be free.
-_OFF, _OFF_FARTHER, _OFF_FAR, _OFF_BEYOND = 0.55, 0.65, 0.85, 0.1
+_OFF, _OFF_FARTHER, _OFF_FAR, _OFF_BEYOND = 0.48, 0.65, 0.85, 0.1
 _NEARER = 0.5  # share by which something may be nearer with which nothing is told near by
 _FAR = 100.0  # shortest baselines
 # However slowly the camera moves, what is nearer than that is near by, or not far away; and what
