@@ -3,9 +3,10 @@
 Evidence counts frames, pixel by pixel. Where a frame may be believed that contradicts what is
 remembered, and where all of them err alike, shows only in how both differ round about: along a
 rim, on a pane, between leaves. A convolutional network (a U-net, Ronneberger et al. 2015), at half
-size and run by OpenCV, sees the newest measurement, what was remembered, and both as one; it
-chooses between them, and tells percentiles of the error of what it chose. It only reads: what is
-remembered goes on as it is (`range_memory`). It was fitted to rendered scenes with exact range
+size and run by OpenCV, sees the newest measurement, what was passed over for it, what was
+remembered, and both as one; it chooses between them, and tells percentiles of the error of what it
+chose, and how probably that is wrong. It only reads: what is remembered goes on as it is
+(`range_memory`). It was fitted to rendered scenes with exact range
 (`sphstereo_ros.bench.memory_judge`).
 """
 from __future__ import annotations
@@ -247,8 +248,8 @@ def told(x: NDArray[np.float32], height: int) -> NDArray[np.float32]:
     """The network's outputs, float32 (8, H, 2H): logarithms of the 68th and 95th percentile of the
     error of what is chosen and of the 98th of how much nearer the truth may be, as shares of the
     inverse range (at least of `pixel_of`), with LEAST added; four by which what was measured,
-    remembered, both as one, or what was passed over is chosen; and the
-    logit of the probability that it is off by over a tenth of its inverse range.
+    remembered, both as one, or what was passed over is chosen; and the logit of the probability
+    that it is off by over a tenth of its inverse range.
     """
     whole = of_each_pixel(interior(_network()(x), height), _TOLD)
     return np.ascontiguousarray(whole[:, :height])

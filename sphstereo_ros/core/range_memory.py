@@ -189,9 +189,10 @@ class RangeMemory:
               view: Image8 | None = None) -> Remembered:
         """Memory and the new measurement of frame `key` as one; it is the memory from now on.
 
-        The result is what is likeliest by its looks, where `view`, the frame's grey, is given and
-        something was remembered. Else it has only what enough frames bear out, and nothing near
-        by (`NEAR_BY` baselines) that is uncertain.
+        The result is what is likeliest by its looks, where `view`, the frame's grey, is given, the
+        measurement tells what is `wider` round about, and something was remembered. Else it has
+        only what enough frames bear out, and nothing near by (`NEAR_BY` baselines) that is
+        uncertain.
         """
         metric = all(r.pose.is_metric for r in references)
         frames = new.frames if vehicle is None else np.where(vehicle, np.int8(0), new.frames)

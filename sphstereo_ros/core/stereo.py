@@ -124,7 +124,7 @@ class SphericalStereo:
         measured = joint.measure(window.current, window.references)
         fused = self._memory.fused(window.current.key, window.references, measured,
                                    None if mask is None else mask != 0,
-                                   window.current.image if joint.signed else None)
+                                   window.current.image)
         down = -mount(self.config.camera).rotation[2]
         wrong, moving = moving_parts(fused, measured, down, metric=window.is_metric)
         if mask is not None:
