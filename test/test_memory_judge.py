@@ -1,13 +1,23 @@
 """What is measured and what is remembered, of which the likelier is told."""
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sphstereo_ros.core import memory_judge
-from sphstereo_ros.core.frames import Frame, FrameKey, Reference, RelativePose
+from sphstereo_ros.core.config import resolve
+from sphstereo_ros.core.frames import (
+    UNSCALED,
+    AlignedWindow,
+    Frame,
+    FrameKey,
+    Reference,
+    RelativePose,
+)
 from sphstereo_ros.core.inverse_range import NOTHING
 from sphstereo_ros.core.joint import Measurement
 from sphstereo_ros.core.memory_judge import (
@@ -22,6 +32,7 @@ from sphstereo_ros.core.memory_judge import (
 )
 from sphstereo_ros.core.range_memory import RangeMemory, Remembered
 from sphstereo_ros.core.reliability import LEAST, NEAR_BY
+from sphstereo_ros.core.stereo import SphericalStereo
 
 HEIGHT = 32
 AHEAD = np.array([0.0, 0.0, 1.0])
@@ -116,13 +127,23 @@ def test_where_the_newest_frame_may_hide_something_near_nothing_is_told(monkeypa
     assert np.argwhere(sigma == NOTHING).tolist() == [[4, 7]]
 
 
-@pytest.mark.parametrize(('rho', 'off', 'known'), [
-    (0.0, 0.11, False), (0.0, 0.09, True), (0.0099, 0.11, False), (0.0101, 0.84, True)])
-def test_what_would_be_told_to_be_free_has_to_be_sure(monkeypatch, rho, off, known):
+@pytest.mark.parametrize('farthest', [20, 50, 120, 500])
+@pytest.mark.parametrize(('times', 'off', 'known'), [
+    (9.0, 0.11, False), (9.0, 0.09, True), (1.5, 0.11, False), (1.3, 0.46, True)])
+def test_what_would_be_told_to_be_free_has_to_be_sure(monkeypatch, farthest, times, off, known):
+    """Three standard deviations of a tenth beyond `farthest` begin at 1.43 times."""
     given = opinions()
-    given.measured[0][:] = rho
-    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), off=off), given)
+    given.measured[0][:] = 1 / (times * farthest)
+    monkeypatch.setattr(memory_judge, '_network', lambda: Tells(0.1, (1, 0, 0), off=off))
+    _, sigma = judged(view(), given, AHEAD, (0.3, 1000.0), 1 / farthest)
     assert ((sigma < NOTHING) == known).all()
+
+
+def test_where_nothing_is_told_to_be_free_it_need_not_be_surer(monkeypatch):
+    given = opinions()
+    given.measured[0][:] = 1e-3
+    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), off=0.8), given)
+    assert (sigma < NOTHING).all()
 
 
 @pytest.mark.parametrize(('ratio', 'frames', 'known'), [
@@ -236,8 +257,9 @@ class Drives:
 
     BASELINE = 0.01  # m
 
-    def __init__(self) -> None:
-        self.memory, self.stamp = RangeMemory(0.45), 0
+    def __init__(self, farthest: float = np.inf, *, metric: bool = True) -> None:
+        self.memory, self.stamp = RangeMemory(0.45, farthest), 0
+        self.position = np.array([0.0, 0.0, -self.BASELINE if metric else -UNSCALED])
 
     def sees(self, grey: np.ndarray | None, rho: float = MEASURED) -> Remembered:
         """Tell the memory; grey : the view, or None where evidence alone decides."""
@@ -246,7 +268,7 @@ class Drives:
                                wider=np.stack([whole(v) for v in WIDER]))
         self.stamp += 33_333_333
         before = FrameKey(self.stamp - 33_333_333, 'camera')
-        pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -self.BASELINE]))
+        pose = RelativePose(np.eye(3), self.position)
         return self.memory.fused(FrameKey(self.stamp, 'camera'),
                                  (Reference(Frame(before, view()), pose),), measured, None, grey)
 
@@ -260,6 +282,17 @@ def test_from_the_second_window_on_the_network_decides_what_is_told(monkeypatch)
     np.testing.assert_allclose(found.sigma, 0.2 * pixel_of(HEIGHT, Drives.BASELINE), rtol=1e-3)
 
 
+@pytest.mark.parametrize(('farthest', 'metric', 'known'), [
+    (5.0, True, False), (15.0, True, True), (np.inf, True, True), (5.0, False, True)])
+def test_what_is_free_hangs_on_the_farthest_range_in_metres(monkeypatch, farthest, metric, known):
+    """Ten metres away: of a camera without scale, ten steps, and nothing is told to be free."""
+    monkeypatch.setattr(memory_judge, '_network', lambda: Tells(1e-3, (1, 0, 0), off=0.3))
+    camera = Drives(farthest, metric=metric)
+    camera.sees(view())
+    found = camera.sees(view(), 0.1)
+    assert ((found.sigma < NOTHING) == known).all()
+
+
 def test_it_only_reads(monkeypatch):
     """What was told has no part in what is remembered."""
     monkeypatch.setattr(memory_judge, '_network', lambda: Tells(0.2, (0, 9, 0)))
@@ -270,3 +303,17 @@ def test_it_only_reads(monkeypatch):
     found, wanted = read.sees(None), other.sees(None)
     for name in ('rho', 'sigma', 'evidence'):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
+
+
+@pytest.mark.parametrize('off', [0.05, 0.3])
+def test_free_is_what_lies_beyond_the_parameter(monkeypatch, off):
+    """Nothing moves while the camera goes 0.3 m a frame."""
+    monkeypatch.setattr(memory_judge, '_network', lambda: Tells(1e-3, (1, 0, 0), off=off))
+    stereo = SphericalStereo(resolve({'range.max': 5.0}))
+    noise = np.random.default_rng(3).integers(0, 255, (128, 256), np.uint8)
+    frames = [Frame(FrameKey(33_333_333 * k, 'camera'), noise) for k in range(3)]
+    pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -0.3]), 1e-12 * np.eye(6))
+    for before, current in pairwise(frames):
+        found = stereo.process(AlignedWindow(current, (Reference(before, pose),)))
+    free = np.isposinf(found.range).mean()
+    assert free > 0.2 if off < 0.1 else free == 0

@@ -193,16 +193,24 @@ def fuse(estimates: list[InverseRange], judged: bool = False) -> InverseRange:
     return InverseRange(rho, sigma, signed)
 
 
+@fast_kernel
+def beyond(rho: np.float32, sigma: np.float32,
+           farthest: np.float32) -> bool:  # pragma: no cover - compiled
+    """Whether it is confidently farther than an inverse range of `farthest`."""
+    spread = np.float32(_CONFIDENT) * sigma
+    return bool(rho + spread < farthest and rho > -spread)
+
+
 @kernel
 def _publish(first: int, last: int, rho: Map, sigma: Map, limits: Map, signed: bool, r_out: Map,
              sigma_out: Map) -> None:  # pragma: no cover - compiled
-    nearest, farthest, max_relative, confident = limits
+    nearest, farthest, max_relative = limits
     nothing = np.float32(np.nan)
     for i in range(first, last):
         for j in range(rho.shape[1]):
             p, s = rho[i, j], sigma[i, j]
             r, spread = nothing, nothing
-            if signed and p + confident * s < farthest and p > -confident * s:
+            if signed and beyond(p, s, farthest):
                 r = np.float32(np.inf)
             elif p > 0 and s <= max_relative * p:
                 if p > nearest:
@@ -224,7 +232,7 @@ def published_range(estimate: InverseRange, limits: RangeConfig, is_metric: bool
     r, sigma = np.empty_like(estimate.rho), np.empty_like(estimate.rho)
     nearest = 1 / max(limits.minimum, 1e-9) if is_metric else np.inf
     farthest = 1 / limits.maximum if is_metric else 0.0
-    bounds = np.array([nearest, farthest, limits.max_relative_sigma, _CONFIDENT], np.float32)
+    bounds = np.array([nearest, farthest, limits.max_relative_sigma], np.float32)
     rows_in_parallel(_publish, r.shape[0], estimate.rho, estimate.sigma, bounds,
                      estimate.signed and is_metric, r, sigma)
     if mask is not None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from .convolutions import Convolutions, of_each_pixel
 from .frames import Image8
-from .inverse_range import NOTHING, _grid_angles
+from .inverse_range import NOTHING, _grid_angles, beyond
 from .jit import fast_kernel, rows_in_parallel
 from .judgement import Evidence
 from .match_judge import likely_error
@@ -40,12 +40,11 @@ _DIFFERENCES = (*range(28, 32), *range(44, 48), *range(68, 72))
 _TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
 # Probabilities of being off by over a tenth with which it is told: near by, farther away, far
 # away, and where it would be told to be free.
-_OFF, _OFF_FARTHER, _OFF_FAR, _OFF_BEYOND = 0.48, 0.65, 0.85, 0.1
+_OFF, _OFF_FARTHER, _OFF_FAR, _OFF_FREE = 0.48, 0.65, 0.85, 0.1
 _NEARER = 0.5  # share by which something may be nearer with which nothing is told near by
 _FAR = 100.0  # shortest baselines
-# However slowly the camera moves, what is nearer than that is near by, or not far away; and what
-# is farther may be told to be free: m.
-_NEAR_M, _FAR_M, _FREE_M = 10.0, 30.0, 100.0
+# However slowly the camera moves, what is nearer than that is near by, or not far away: m.
+_NEAR_M, _FAR_M = 10.0, 30.0
 _BEFORE = 1.3  # times as far away as what the newest frame is believed to see near by
 
 
@@ -197,8 +196,6 @@ def _bound(rho: np.float32, baseline: np.float32,
            bounds: Map) -> np.float32:  # pragma: no cover - compiled
     if _near_by(rho, baseline):
         return np.float32(bounds[0])
-    if rho * np.float32(_FREE_M) < 1:
-        return np.float32(bounds[3])
     far = rho * max(baseline * np.float32(_FAR), np.float32(_FAR_M)) < 1
     return np.float32(bounds[2] if far else bounds[1])
 
@@ -220,8 +217,8 @@ def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tupl
                 frames: Evidence, before: tuple[Map, ...], fused: tuple[Map, ...],
                 other: Map, pose: Map, scale: Map, bounds: Map, rho: Map,
                 sigma: Map) -> None:  # pragma: no cover - compiled
-    """scale : inverse range of a pixel, shortest baseline, share of the 95th percentile; bounds :
-    logits of being off, as of _OFF
+    """scale : inverse range of a pixel, shortest baseline, share of the 95th percentile, inverse
+    range of what is told to be free; bounds : logits of being off, as of _OFF
     """
     nothing, least, pixel = np.float32(NOTHING), np.float32(LEAST), scale[0]
     for i in range(first, last):
@@ -233,10 +230,12 @@ def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tupl
             hides |= frames[i, j] > 0 and _near_by(measured[0][i, j], scale[1]) and (
                 measured[0][i, j] > np.float32(_BEFORE) * best)
             own = likely_error(told, 0, i, j, scale[2]) * unit
-            rho[i, j], sigma[i, j] = best, nothing
+            spread = np.sqrt(own * own + pose[i, j] * pose[i, j])
             sure = told[7, i, j] <= _bound(best, scale[1], bounds)
+            sure &= told[7, i, j] <= bounds[3] or not beyond(best, spread, scale[3])
+            rho[i, j], sigma[i, j] = best, nothing
             if sure and not hides and frames[i, j] >= 0:
-                sigma[i, j] = np.sqrt(own * own + pose[i, j] * pose[i, j])
+                sigma[i, j] = spread
 
 
 def _logits(*probabilities: float) -> Map:
@@ -256,15 +255,16 @@ def told(x: NDArray[np.float32], height: int) -> NDArray[np.float32]:
 
 
 def judged(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
-           baselines: tuple[float, float]) -> tuple[Map, Map]:
+           baselines: tuple[float, float], farthest: float = 0.0) -> tuple[Map, Map]:
     """Inverse range and its standard deviation, NOTHING where none is told, float32 (H, 2H), 1/m.
 
-    As of `inputs`.
+    As of `inputs`; farthest : inverse range, 1/m, confidently beyond which all is told to be free
     """
     outputs = told(inputs(view, opinions, direction, baselines), len(view))
     rho, sigma = np.empty((2, *view.shape), np.float32)
-    scale = np.array([pixel_of(len(view), baselines[1]), baselines[0], np.exp(-_TAIL)], np.float32)
+    scale = np.array([pixel_of(len(view), baselines[1]), baselines[0], np.exp(-_TAIL), farthest],
+                     np.float32)
     rows_in_parallel(_judge_rows, len(rho), outputs, opinions.measured, opinions.frames,
                      opinions.before, opinions.fused, opinions.wider[3], opinions.pose, scale,
-                     _logits(_OFF, _OFF_FARTHER, _OFF_FAR, _OFF_BEYOND), rho, sigma)
+                     _logits(_OFF, _OFF_FARTHER, _OFF_FAR, _OFF_FREE), rho, sigma)
     return rho, sigma

@@ -11,6 +11,7 @@ picture from frame to frame, so the same windows match it, and err alike.
 """
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -174,10 +175,12 @@ class RangeMemory:
     """Fuses measurements over time.
 
     seconds : how long what nothing confirms is kept at most
+    farthest : range, m, confidently beyond which all is told to be free, and has to be surer
     """
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, seconds: float, farthest: float = math.inf) -> None:
         self._seconds = seconds
+        self._farthest = farthest
         self._history = PoseHistory()
         self._key: FrameKey | None = None
         self._kept: Remembered | None = None
@@ -219,7 +222,8 @@ class RangeMemory:
         """The likeliest inverse range and its sigma."""
         baselines = [in_steps(r.pose).baseline for r in references]
         return judged(view, opinions, references[0].pose.direction,
-                      (min(baselines), max(baselines)))
+                      (min(baselines), max(baselines)),
+                      1 / self._farthest if self._metric else 0.0)
 
     def forget(self, where: NDArray[np.bool_]) -> None:
         """Keep nothing of these pixels of the newest frame."""

@@ -52,7 +52,7 @@ class SphericalStereo:
             self._pair = PairMatcher(config.stereo.matcher, self._match,
                                      config.baseline.relative_sigma)
         self._rig = Rig(config.pairing.mode == 'binocular')
-        self._memory = RangeMemory(config.stereo.memory)
+        self._memory = RangeMemory(config.stereo.memory, config.range.maximum)
         self._mask = mask
 
     def remember_in(self, memory: RangeMemory) -> None:
@@ -73,7 +73,7 @@ class SphericalStereo:
             top = Reference(Frame(FrameKey(0, 'top'), noise), pose)
             self.process(AlignedWindow(frames[1], (top, Reference(frames[0], pose))))
             self._rig = Rig(binocular=True)
-        self._memory = RangeMemory(self.config.stereo.memory)
+        self._memory = RangeMemory(self.config.stereo.memory, self.config.range.maximum)
         nothing = np.zeros(noise.shape, np.float32)
         under_floor(nothing, nothing, np.zeros(3))  # noise has no floor
 
