@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from sphstereo_ros.core import memory_judge
 from sphstereo_ros.core.config import resolve
+from sphstereo_ros.core.floor import floor_seen
 from sphstereo_ros.core.frames import (
     UNSCALED,
     AlignedWindow,
@@ -24,6 +25,7 @@ from sphstereo_ros.core.memory_judge import (
     BLOCK,
     CHANNELS,
     ROUND,
+    THERE,
     Opinions,
     inputs,
     interior,
@@ -37,7 +39,9 @@ from sphstereo_ros.core.stereo import SphericalStereo
 HEIGHT = 32
 AHEAD = np.array([0.0, 0.0, 1.0])
 BASELINES = (0.3, 3.0)
-MEASURED, REMEMBERED, BOTH, PASSED_OVER = 0.1, 0.08, 0.09, 0.085  # 1/m
+MEASURED, REMEMBERED, BOTH, PASSED_OVER, FLOOR, WALL = (
+    0.1, 0.08, 0.09, 0.085, 0.12, 0.078)  # 1/m
+CARRIES = 0.4
 WIDER = (0.012, 0.03, 0.02, PASSED_OVER, 0.014, 0.035, 0.025)  # 1/m
 PIXEL = pixel_of(HEIGHT, BASELINES[1])
 
@@ -53,6 +57,8 @@ def opinions(height: int = HEIGHT, *, remembered: bool = True, pose: float = 0.0
                     whole(2, np.int8, height),
                     tuple(whole(v, height=height) for v in (old, known, 3, 0.4)),
                     tuple(whole(v, height=height) for v in (both, 0.004, 5)),
+                    whole(FLOOR, height=height),
+                    (whole(WALL, height=height), whole(CARRIES, height=height)),
                     whole(pose, height=height),
                     np.stack([whole(v, height=height) for v in WIDER]))
 
@@ -63,14 +69,15 @@ def view(height: int = HEIGHT) -> np.ndarray:
 
 class Tells:
     """In place of the network: the same everywhere, share of the inverse range that the error is,
-    choices, probability of being off, and share by which the truth may be nearer.
+    choices, probability of being off, share by which the truth may be nearer, and probability of
+    sky.
     """
 
     def __init__(self, likely: float, choices: tuple[float, ...], off: float = 0.01,
-                 nearer: float = 0.05) -> None:
-        choices = (*choices, *[-9.0] * (4 - len(choices)))
+                 nearer: float = 0.05, sky: float = 0.01) -> None:
+        choices = (*choices, *[-9.0] * (6 - len(choices)))
         self.outputs = [*np.log(np.array([likely, likely, nearer]) + LEAST), *choices,
-                        np.log(off / (1 - off))]
+                        np.log(off / (1 - off)), np.log(sky / (1 - sky))]
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         out = np.repeat(np.asarray(self.outputs, np.float32), 4)
@@ -85,7 +92,7 @@ def told(monkeypatch: pytest.MonkeyPatch, net: object, given: Opinions) -> tuple
 
 @pytest.mark.parametrize(('choices', 'rho'), [
     ((1, 0, 0), MEASURED), ((0, 1, 0), REMEMBERED), ((0, 0, 1), BOTH),
-    ((0, 0, 1, 2), PASSED_OVER)])
+    ((0, 0, 1, 2), PASSED_OVER), ((0, 0, 0, 1, 2), FLOOR), ((0, 0, 0, 0, 1, 2), WALL)])
 def test_the_likeliest_is_told_with_its_error(monkeypatch, choices, rho):
     found, sigma = told(monkeypatch, Tells(0.1, choices), opinions(pose=0.003))
     np.testing.assert_allclose(found, rho, rtol=1e-6)
@@ -96,6 +103,16 @@ def test_what_was_not_remembered_is_not_chosen(monkeypatch):
     found, sigma = told(monkeypatch, Tells(0.1, (0, 9, 1)), opinions(remembered=False))
     np.testing.assert_allclose(found, MEASURED, rtol=1e-6)
     assert (sigma < NOTHING).all()
+
+
+@pytest.mark.parametrize(('choices', 'surface'), [((0, 0, 0, 1, 2), FLOOR),
+                                                  ((0, 0, 0, 1, 0, 2), WALL)])
+def test_a_floor_or_wall_is_chosen_only_where_there_is_one(monkeypatch, choices, surface):
+    given = opinions()
+    (given.floor if surface == FLOOR else given.wall[0])[:HEIGHT // 2] = 0
+    found, _ = told(monkeypatch, Tells(0.1, choices), given)
+    np.testing.assert_allclose(found[:HEIGHT // 2], PASSED_OVER, rtol=1e-6)
+    np.testing.assert_allclose(found[HEIGHT // 2:], surface, rtol=1e-6)
 
 
 def test_the_error_is_a_share_of_a_pixel_at_least(monkeypatch):
@@ -109,6 +126,15 @@ def test_the_error_is_a_share_of_a_pixel_at_least(monkeypatch):
 def test_what_is_likely_wrong_is_unknown(monkeypatch):
     _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), off=0.9), opinions())
     assert (sigma == NOTHING).all()
+
+
+@pytest.mark.parametrize(('baselines', 'sky', 'known'), [
+    (39, 0.04, True), (39, 0.06, False), (41, 0.9, True)])
+def test_what_may_be_only_sky_is_not_told_near_by(monkeypatch, baselines, sky, known):
+    given = opinions()
+    given.measured[0][:] = 1 / (baselines * BASELINES[0])
+    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), sky=sky), given)
+    assert ((sigma < NOTHING) == known).all()
 
 
 @pytest.mark.parametrize('near', [True, False])
@@ -158,24 +184,24 @@ def test_nothing_is_told_behind_what_the_newest_frame_sees_near_by(monkeypatch, 
     assert ((sigma < NOTHING) == known).all()
 
 
-@pytest.mark.parametrize(('baselines', 'off', 'known'), [
-    (39, 0.47, True), (39, 0.49, False), (41, 0.64, True), (99, 0.66, False), (101, 0.84, True),
-    (101, 0.86, False)])
-def test_how_sure_it_has_to_be_hangs_on_how_far_away_it_is(monkeypatch, baselines, off, known):
+@pytest.mark.parametrize('baselines', [10, 60, 200])
+@pytest.mark.parametrize(('off', 'known'), [(0.84, True), (0.86, False)])
+def test_what_is_probably_off_is_unknown_at_any_range(monkeypatch, baselines, off, known):
     given = opinions()
     given.measured[0][:] = 1 / (baselines * BASELINES[0])
     _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), off=off), given)
     assert ((sigma < NOTHING) == known).all()
 
 
-@pytest.mark.parametrize(('distance', 'off', 'nearer', 'known'), [
-    (9.9, 0.49, 0.05, False), (10.1, 0.64, 0.05, True), (29.9, 0.66, 0.05, False),
-    (30.1, 0.84, 0.05, True), (16.0, 0.01, 0.75, False), (18.0, 0.01, 0.75, True)])
-def test_ten_metres_are_near_however_slowly_the_camera_moves(monkeypatch, distance, off, nearer,
+@pytest.mark.parametrize(('distance', 'nearer', 'sky', 'known'), [
+    (16.5, 0.75, 0.01, False), (18.0, 0.75, 0.01, True), (5.0, 0.65, 0.01, True),
+    (9.9, 0.05, 0.06, False), (10.1, 0.05, 0.06, True)])
+def test_ten_metres_are_near_however_slowly_the_camera_moves(monkeypatch, distance, nearer, sky,
                                                              known):
     given = opinions()
     given.measured[0][:] = 1 / distance
-    monkeypatch.setattr(memory_judge, '_network', lambda: Tells(0.1, (1, 0, 0), off, nearer))
+    monkeypatch.setattr(memory_judge, '_network',
+                        lambda: Tells(0.1, (1, 0, 0), nearer=nearer, sky=sky))
     _, sigma = judged(view(), given, AHEAD, (0.03, 30.0))
     assert ((sigma < NOTHING) == known).all()
 
@@ -195,14 +221,16 @@ def test_what_the_network_sees():
               np.log(0.001 + 0.004 / 0.09), 5 / 6,
               *np.log(0.001 + np.array(WIDER[:3]) / 0.2),
               np.log((PASSED_OVER + PIXEL) / (0.2 + PIXEL)),
-              *np.log(0.001 + np.array(WIDER[4:]) / PASSED_OVER)]
-    np.testing.assert_allclose(inside[(slice(n, 84, 4), *at)], wanted, atol=1e-3)
+              *np.log(0.001 + np.array(WIDER[4:]) / PASSED_OVER),
+              1, np.log((FLOOR + PIXEL) / (0.2 + PIXEL)),
+              CARRIES, np.log((WALL + PIXEL) / (0.2 + PIXEL))]
+    np.testing.assert_allclose(inside[(slice(n, 100, 4), *at)], wanted, atol=1e-3)
     elsewhere = inside[0, 3, 4]
     assert elsewhere == pytest.approx(np.log(1 + 0.1 / PIXEL), abs=1e-3)
-    assert inside[85].mean() == pytest.approx(np.log(0.1), abs=1e-3)
+    assert inside[101].mean() == pytest.approx(np.log(0.1), abs=1e-3)
     longitude = (np.arange(HEIGHT) + 0.75) / HEIGHT * 2 * np.pi - np.pi
     along = np.cos(longitude) * np.cos(1.5 / HEIGHT * np.pi)
-    np.testing.assert_allclose(inside[84, HEIGHT // 4], np.sqrt(1 - along**2), atol=1e-3)
+    np.testing.assert_allclose(inside[100, HEIGHT // 4], np.sqrt(1 - along**2), atol=1e-3)
 
 
 def test_nothing_remembered_looks_like_nothing():
@@ -213,16 +241,23 @@ def test_nothing_remembered_looks_like_nothing():
     np.testing.assert_allclose(x[44:48], 0, atol=1e-3)
 
 
+def test_no_floor_and_no_wall_look_like_none():
+    given = opinions()
+    given.floor[:], given.wall[0][:], given.wall[1][:] = 0, 0, 0
+    x = interior(inputs(view(), given, AHEAD, BASELINES), HEIGHT)[0]
+    np.testing.assert_allclose(x[THERE:THERE + 16], 0, atol=1e-3)
+
+
 def test_it_goes_on_round_the_sphere():
     given = opinions()
     given.measured[0][:, :2] = 0.3
     x = inputs(view(), given, AHEAD, BASELINES)
-    np.testing.assert_array_equal(x[0, :84, :, ROUND], x[0, :84, :, ROUND + HEIGHT])
+    np.testing.assert_array_equal(x[0, :100, :, ROUND], x[0, :100, :, ROUND + HEIGHT])
     turned = opinions()
     turned.measured[0][:, 20:22] = 0.3
     turned = inputs(view(), turned, AHEAD, BASELINES)
-    np.testing.assert_array_equal(interior(turned, HEIGHT)[0, :84, :, 10],
-                                  interior(x, HEIGHT)[0, :84, :, 0])
+    np.testing.assert_array_equal(interior(turned, HEIGHT)[0, :100, :, 10],
+                                  interior(x, HEIGHT)[0, :100, :, 0])
 
 
 @settings(deadline=None, max_examples=25)
@@ -239,7 +274,8 @@ def test_whatever_it_sees_what_it_tells_is_one_of_them(height, seed):
                      (some(0, 1), np.where(unknown[0], NOTHING, some(1e-6, 2)).astype(np.float32),
                       some(-2, 6), some(0, 1)),
                      (some(0, 1), np.where(unknown[1], NOTHING, some(1e-6, 2)).astype(np.float32),
-                      some(-2, 6)), some(0, 0.1),
+                      some(-2, 6)), np.maximum(some(-1, 1), 0),
+                     (np.maximum(some(-1, 1), 0), some(0, 1)), some(0, 0.1),
                      np.stack([some(0, 2) if n != 3 else some(-0.1, 1) for n in range(7)]))
     grey = rng.integers(0, 256, shape).astype(np.uint8)
     x = inputs(grey, given, AHEAD, BASELINES)
@@ -247,7 +283,8 @@ def test_whatever_it_sees_what_it_tells_is_one_of_them(height, seed):
     rho, sigma = judged(grey, given, AHEAD, BASELINES)
     assert rho.shape == sigma.shape == shape
     old, both = ((rho == m[0]) & (m[1] < NOTHING) for m in (given.before, given.fused))
-    assert ((rho == given.measured[0]) | old | both | (rho == given.wider[3])).all()
+    surface = np.logical_or(*((rho == m) & (m > 0) for m in (given.floor, given.wall[0])))
+    assert ((rho == given.measured[0]) | old | both | (rho == given.wider[3]) | surface).all()
     assert ((sigma == NOTHING) | (sigma >= given.pose)).all()
     assert (sigma > 0).all()
 
@@ -291,6 +328,26 @@ def test_what_is_free_hangs_on_the_farthest_range_in_metres(monkeypatch, farthes
     camera.sees(view())
     found = camera.sees(view(), 0.1)
     assert ((found.sigma < NOTHING) == known).all()
+
+
+@pytest.mark.parametrize('down', [np.array([0.0, 1, 0]), np.array([0.0, -1, 0])])
+def test_the_floor_is_that_of_what_is_known(monkeypatch, down):
+    """The vehicle's down decides whether it is a floor or a ceiling."""
+    monkeypatch.setattr(memory_judge, '_network', lambda: Tells(0.2, (0, 0, 0, 0, 9)))
+    height, plane = 96, np.array([0.05, 0.6, 0.02])
+    carried = floor_seen(plane, height)
+    memory, pose = RangeMemory(0.45, down=down), np.array([0.0, 0.0, -0.01])
+    for k in range(1, 3):
+        measured = Measurement(carried + np.float32(0.05), *(whole(v, height=height) for v in (
+            1e-3, MEASURED)), whole(1, np.int8, height), whole(0.01, height=height),
+            whole(0.003, height=height), wider=np.stack([whole(v, height=height) for v in WIDER]))
+        below = carried > 0.1
+        measured.rho[below] = carried[below]
+        keys = [FrameKey(33_333_333 * n, 'camera') for n in (k - 1, k)]
+        found = memory.fused(keys[1], (Reference(Frame(keys[0], view(height)), RelativePose(
+            np.eye(3), pose)),), measured, None, view(height))
+    wanted = carried if down[1] > 0 else np.where(measured.rho < 0, 0, measured.rho)
+    np.testing.assert_allclose(found.rho[carried > 0.05], wanted[carried > 0.05], rtol=0.02)
 
 
 def test_it_only_reads(monkeypatch):

@@ -8,17 +8,27 @@ import pytest
 from test_memory_judge import (
     AHEAD,
     BASELINES,
+    FLOOR,
     HEIGHT,
     MEASURED,
     PASSED_OVER,
     PIXEL,
+    WALL,
     opinions,
     view,
 )
 
 from sphstereo_ros.bench import memory_judge as bench
-from sphstereo_ros.bench.memory_judge import DESIGN, Patch, fit, loss, patch_of, patches_of
-from sphstereo_ros.core.memory_judge import CHANNELS, pixel_of
+from sphstereo_ros.bench.memory_judge import (
+    DESIGN,
+    Patch,
+    _varied,
+    fit,
+    loss,
+    patch_of,
+    patches_of,
+)
+from sphstereo_ros.core.memory_judge import CHANNELS, THERE, pixel_of
 from sphstereo_ros.scenes.sequence import TruthFrame, render_sequence, save_sequence
 
 
@@ -35,12 +45,11 @@ def patch(distance: float, moving: bool = False) -> Patch:
 
 def test_a_patch_tells_how_far_each_is_from_the_truth():
     found = patch(8.0)
-    true, old, both, other = ((rho + PIXEL) / (MEASURED + PIXEL)
-                              for rho in (1 / 8, 0.08, 0.09, PASSED_OVER))
+    true, *others = ((rho + PIXEL) / (MEASURED + PIXEL)
+                     for rho in (1 / 8, 0.08, 0.09, PASSED_OVER, FLOOR, WALL))
     np.testing.assert_allclose(found.true, np.log(true), atol=1e-3)
-    np.testing.assert_allclose(found.found[0], np.log(old), atol=1e-3)
-    np.testing.assert_allclose(found.found[1], np.log(both), atol=1e-3)
-    np.testing.assert_allclose(found.found[2], np.log(other), atol=1e-3)
+    for n, other in enumerate(others):
+        np.testing.assert_allclose(found.found[n], np.log(other), atol=1e-3)
     assert found.x.shape == (CHANNELS, HEIGHT // 2, HEIGHT)
 
 
@@ -69,7 +78,7 @@ def samples(rng: np.random.Generator) -> Patch:
     x[0:4], x[20:24] = 3.0, 0.0
     x[20:24, :, 32:] = 1.0
     right = np.broadcast_to(np.arange(128) >= 64, (128, 128))
-    found = np.stack([np.full((128, 128), off) for off in (-0.3, 0.3, 0.4)])
+    found = np.stack([np.full((128, 128), off) for off in (-0.3, 0.3, 0.4, 0.2, 0.5)])
     true = np.where(right, -0.3, 0.0) + rng.normal(0, 0.01, (128, 128))
     maps = [m.astype(np.float16) for m in (found, true, np.ones((128, 128)))]
     return Patch(x.astype(np.float16), *maps)
@@ -84,7 +93,7 @@ def test_a_fit_chooses_and_tells_the_error():
     with torch.no_grad():
         x = torch.from_numpy(given.x.astype(np.float32))[None]
         out = torch.nn.functional.pixel_shuffle(DESIGN.forward(parts, x), 2)[0].numpy()
-    choice = out[3:7].argmax(0)
+    choice = out[3:9].argmax(0)
     inside = np.s_[8:-8, 8:56], np.s_[8:-8, 72:120]
     assert (choice[inside[0]] == 0).mean() > 0.9
     assert (choice[inside[1]] == 1).mean() > 0.9
@@ -105,6 +114,48 @@ def test_a_choice_that_is_too_far_costs_most():
         out[:, 12:16] = 20.0  # what was measured
         return float(loss(out, x, found, true * one, one))
     assert costs(0.0) < costs(-0.4) < costs(0.4) - 1.0
+
+
+@pytest.mark.parametrize('sky', [True, False])
+def test_it_costs_to_take_sky_for_something_or_something_for_sky(sky):
+    torch = pytest.importorskip('torch')
+    given = samples(np.random.default_rng(0))
+    x = torch.from_numpy(given.x.astype(np.float32))[None]
+    found = torch.from_numpy(given.found.astype(np.float32))[None]
+    one = torch.ones(1, 1, 128, 128)
+    level = 3.0  # its parallax is e³ − 1 px: with −3, nothing is there
+
+    def costs(logit: float) -> float:
+        out = torch.zeros(1, len(DESIGN.begin), 64, 64)
+        out[:, :12] = np.log(0.01)
+        out[:, 40:] = logit
+        return float(loss(out, x, found, (-level if sky else -0.2) * one, one))
+    assert (costs(3.0) < costs(-3.0) - 2.0) == sky
+    assert (costs(-3.0) < costs(3.0) - 2.0) == (not sky)
+
+
+@pytest.mark.parametrize('surface', [0, 1])
+def test_a_floor_or_wall_may_be_missing_or_not_where_it_seems_to_be(surface):
+    """Where it is seen by some of four pixels only, only those change."""
+    pytest.importorskip('torch')
+    given = samples(np.random.default_rng(0))
+    x, at = given.x.astype(np.float32), THERE + 8 * surface
+    x[at:at + 8] = 0
+    x[at:at + 2, 32:], x[at + 4:at + 6, 32:] = 1, 0.2
+    there = np.zeros((128, 128), np.bool_)
+    there[64::2] = True
+    found = given.found.copy()
+    found[3 + surface] = np.where(there, 0.2, 0)
+    given = replace(given, x=x.astype(np.float16), found=found)
+    rng, kinds = np.random.default_rng(1), set()
+    for _ in range(60):
+        seen, _, drawn, *_ = _varied(given, rng)
+        where, own = drawn[0, 3 + surface].numpy(), seen[0, at + 4:at + 8].numpy()
+        offs = np.unique(where.round(4))
+        assert len(offs) <= 2
+        assert np.unique(own.round(3)).tolist() == np.unique(where.round(3)).tolist()
+        kinds.add('none' if not where.any() else 'as it is' if 0.2 in offs.round(3) else 'off')
+    assert kinds == {'none', 'as it is', 'off'}
 
 
 def test_nothing_is_fitted_to_what_is_not_known():

@@ -26,6 +26,7 @@ from sphstereo_ros.core.memory_judge import (
     CHANNELS,
     LEVEL,
     SIGMAS,
+    THERE,
     VIEW,
     Opinions,
     inputs,
@@ -62,15 +63,22 @@ _BEGIN = -2.3  # logarithm of the error that it starts from
 _ROWS, _COLUMNS, _BATCH, _RATE = 160, 240, 3, 1.5e-3
 _TRUE = 0.02  # share of a sample of which the truth has to be known
 # Of what is chosen: the logarithm of its error counts up to _WRONG; so much more where it is
-# farther than the truth by more than such a logarithm; and how much all that counts.
+# farther than the truth by more than such a logarithm; how much all that counts; and how much that
+# the better ones are likelier (cross entropy; by such a difference it is e times better). By what
+# is to be expected alone, nothing would be learnt of a choice that is never taken.
 _WRONG, _FARTHER, _WORSE, _CHOICE = 0.5, 0.35, 0.3, 4.0
+_BETTER, _DIFFERENCE = 0.4, 0.05
 _POSES, _POSE = 0.3, 0.05  # share of samples of which poses are unsure, and by how much
+# Shares of samples without a floor or walls, and with such that are not where they seem to be, and
+# by how much.
+_NO_SURFACE, _SURFACES, _SURFACE = 0.15, 0.2, 0.2
 
 _OFF, _RARELY = 0.1, -2.0  # share of the inverse range by which it is off, and a logit to begin
+_SKY = 0.05  # px of parallax of the longest baseline: with less nothing is there
 
-_OF_ERROR, _CHOSEN = len(PERCENTILES), 4
+_OF_ERROR, _CHOSEN = len(PERCENTILES), 6
 DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
-                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * (4 * _CHOSEN) + [_RARELY] * 4,
+                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * (4 * _CHOSEN) + [_RARELY] * 8,
                 deep=True)
 
 
@@ -78,11 +86,11 @@ DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
 class Patch:
     """What the network sees of a frame and should tell.
 
-    x : float16 (CHANNELS, rows, columns); found, true : float16 (3, 2 rows, 2 columns) and (2
+    x : float16 (CHANNELS, rows, columns); found, true : float16 (5, 2 rows, 2 columns) and (2
     rows, 2 columns), logarithms of how many times as large as measured the inverse range is that
-    was remembered, that both are as one, that was passed over, and the true one, a pixel of the
-    longest baseline's parallax added to each; weight : the same, 0 where the truth is unknown, or
-    moves and is found too near
+    was remembered, that both are as one, that was passed over, of floor and wall, and the true
+    one, a pixel of the longest baseline's parallax added to each; weight : the same, 0 where the
+    truth is unknown, or moves and is found too near
     """
 
     x: NDArray[np.float16]
@@ -104,7 +112,8 @@ def patch_of(truth: TruthFrame, view: Image8, opinions: Opinions, direction: NDA
         return np.asarray(np.where(where, found, 0), np.float32)
     found = [against(rho, sigma < NOTHING)
              for rho, sigma, *_ in (opinions.before, opinions.fused)]
-    found.append(against(opinions.wider[3]))
+    found += [against(opinions.wider[3]), *(
+        against(rho, rho > 0) for rho in (opinions.floor, opinions.wall[0]))]
     wanted = against(np.nan_to_num(true))
     weight = np.isfinite(true) * _areas(height)
     if truth.moving is not None:  # what moves seems near or far by its speed
@@ -132,11 +141,9 @@ class _Kept(RangeMemory):
     truth: TruthFrame
     patch: Patch | None = None
 
-    def _judged(self, view: Image8, opinions: Opinions, references: tuple[Reference, ...],
-                ) -> tuple[Map, Map]:
-        baselines = [r.pose.baseline for r in references]
-        self.patch = patch_of(self.truth, view, opinions, references[0].pose.direction,
-                              (min(baselines), max(baselines)))
+    def _judged(self, view: Image8, opinions: Opinions, direction: NDArray[np.float64],
+                baselines: tuple[float, float]) -> tuple[Map, Map]:
+        self.patch = patch_of(self.truth, view, opinions, direction, baselines)
         return opinions.fused[:2]
 
 
@@ -175,7 +182,9 @@ def render(folder: Path) -> None:
 
 
 def loss(out: Any, x: Any, found: Any, true: Any, weight: Any) -> Any:
-    """Of the percentiles of what is chosen, of how probably it is off, and of the choice."""
+    """Of the percentiles of what is chosen, of how probably it is off and only sky is there, and
+    of the choice.
+    """
     import torch
     from torch.nn import functional
     told = functional.pixel_shuffle(out, 2)
@@ -184,13 +193,16 @@ def loss(out: Any, x: Any, found: Any, true: Any, weight: Any) -> Any:
     nearer = true - each
     wrong = nearer.abs().clamp(max=_WRONG) + _WORSE * (nearer > _FARTHER)
     choices, doubt = told[:, _OF_ERROR:_OF_ERROR + _CHOSEN], told[:, _OF_ERROR + _CHOSEN:]
-    chosen = (torch.softmax(choices, 1) * wrong).sum(1, keepdim=True)
+    chosen = _CHOICE * torch.softmax(choices, 1) * wrong - _BETTER * torch.softmax(
+        -wrong / _DIFFERENCE, 1) * torch.log_softmax(choices, 1)
     likeliest = torch.exp(level + each.gather(1, choices.argmax(1, keepdim=True))) - 1
-    off = (torch.exp(level + true) - 1 - likeliest) / likeliest.clamp(min=1)
+    pixels = torch.exp(level + true) - 1
+    off = (pixels - likeliest) / likeliest.clamp(min=1)
     doubted = functional.binary_cross_entropy_with_logits(
-        doubt, (off.abs() > _OFF).float(), reduction='none')
+        doubt, torch.cat([off.abs() > _OFF, pixels < _SKY], 1).float(),
+        reduction='none').sum(1, keepdim=True)
     return (percentile_loss(told[:, :_OF_ERROR], off, weight, LEAST, MOST, PERCENTILES)
-            + (weight * (_CHOICE * chosen + doubted)).sum() / weight.sum())
+            + (weight * (chosen.sum(1, keepdim=True) + doubted)).sum() / weight.sum())
 
 
 def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, ...]:
@@ -203,11 +215,31 @@ def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, ...]:
         share = _POSE * float(rng.random())
         for at in SIGMAS:
             x[:, at:at + 4] = 0.5 * torch.log(torch.exp(2 * x[:, at:at + 4]) + share**2)
+    for n in range(2):
+        _vary_surface(x[:, THERE + 8 * n:THERE + 8 * n + 8], maps[0][:, n - 2], rng)
     if rng.random() < 0.5:
         x, *maps = (torch.flip(m, [3]) for m in (x, *maps))
         for at in range(0, CHANNELS // 4 * 4, 4):
             x[:, at:at + 4] = x[:, at:at + 4][:, [1, 0, 3, 2]]
     return x, x, *maps
+
+
+def _vary_surface(x: Any, found: Any, rng: np.random.Generator) -> None:
+    """Of floor or wall, its inputs and where it was found: without it, or elsewhere."""
+    there, seen = x[:, :4] > 0, x[:, 4:]
+    drawn = rng.random()
+    if drawn < _NO_SURFACE:
+        x[:], found[:] = 0, 0
+    elif drawn < _NO_SURFACE + _SURFACES:
+        off = float(rng.normal(0, _SURFACE))
+        seen[there] = (seen[there] + off).clamp(-2, 2)
+        found[_on_pixels(there)] += off
+
+
+def _on_pixels(four: Any) -> Any:
+    """(1, 4, rows, columns) as (1, 2 rows, 2 columns)."""
+    from torch.nn import functional
+    return functional.pixel_shuffle(four.float(), 2)[:, 0] > 0
 
 
 def _part(patch: Patch, rng: np.random.Generator) -> tuple[Any, list[Any]]:

@@ -4,10 +4,10 @@ Evidence counts frames, pixel by pixel. Where a frame may be believed that contr
 remembered, and where all of them err alike, shows only in how both differ round about: along a
 rim, on a pane, between leaves. A convolutional network (a U-net, Ronneberger et al. 2015), at half
 size and run by OpenCV, sees the newest measurement, what was passed over for it, what was
-remembered, and both as one; it chooses between them, and tells percentiles of the error of what it
-chose, and how probably that is wrong. It only reads: what is remembered goes on as it is
-(`range_memory`). It was fitted to rendered scenes with exact range
-(`sphstereo_ros.bench.memory_judge`).
+remembered, both as one, and the floor and the likeliest wall behind it; it chooses between
+them, and tells percentiles of the error of what it chose, and how probably that is wrong, or only
+sky is there. It only reads: what is remembered goes on as it is (`range_memory`). It was fitted to
+rendered scenes with exact range (`sphstereo_ros.bench.memory_judge`).
 """
 from __future__ import annotations
 
@@ -26,25 +26,26 @@ from .match_judge import likely_error
 from .reliability import LEAST, NEAR_BY, logarithms
 from .warp import Map
 
-_EACH = 21  # inputs of each pixel
+_EACH = 25  # inputs of each pixel
 CHANNELS = 4 * _EACH + 2  # and of each four
-LEVEL, SIGMAS, VIEW = 0, (4, 32, 48), 20  # inputs: where those of four pixels begin
-_TOLD = 8  # outputs for each pixel
+# Inputs: where those of four pixels begin. THERE: whether there is a floor, where, how much a wall
+# carries, and where that is.
+LEVEL, SIGMAS, VIEW, THERE = 0, (4, 32, 48), 20, 84
+_TOLD = 11  # outputs for each pixel
 BLOCK = 8  # px at half size: what the network halves three times
 ROUND = 16  # px at half size that it sees beyond the seam
 _LEAST, _MOST = np.float32(1e-3), np.float32(10)  # shares that sigma counts for
 _APART = np.float32(2)  # logarithm by which inverse ranges differ at most, or share
 _EVIDENCE = np.float32(1 / 6)
-_LOGARITHMS = (*range(8), *range(16, 20), *range(28, 36), *range(44, 52), *range(56, 84), 85)
-_DIFFERENCES = (*range(28, 32), *range(44, 48), *range(68, 72))
+_LOGARITHMS = (*range(8), *range(16, 20), *range(28, 36), *range(44, 52), *range(56, 84),
+               *range(88, 92), *range(96, 100), 101)
+_DIFFERENCES = (*range(28, 32), *range(44, 48), *range(68, 72), *range(88, 92), *range(96, 100))
 _TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
-# Probabilities of being off by over a tenth with which it is told: near by, farther away, far
-# away, and where it would be told to be free.
-_OFF, _OFF_FARTHER, _OFF_FAR, _OFF_FREE = 0.48, 0.65, 0.85, 0.1
-_NEARER = 0.5  # share by which something may be nearer with which nothing is told near by
-_FAR = 100.0  # shortest baselines
-# However slowly the camera moves, what is nearer than that is near by, or not far away: m.
-_NEAR_M, _FAR_M = 10.0, 30.0
+# Probabilities of being off by over a tenth with which it is told, and told to be free.
+_OFF, _OFF_FREE = 0.85, 0.1
+_SKY = 0.05  # probability that only sky is there with which nothing is told near by
+_NEARER = 0.7  # share by which something may be nearer with which nothing is told near by
+_NEAR_M = 10.0  # m: what is nearer is near by, however slowly the camera moves
 _BEFORE = 1.3  # times as far away as what the newest frame is believed to see near by
 
 
@@ -58,6 +59,8 @@ class Opinions:
     before : inverse range, sigma (NOTHING where unknown) and evidence of what was remembered, and
     how much its errors are like those of the newest frame
     fused : inverse range, sigma and evidence of both as one
+    floor : inverse range of the floor if nothing hides it, as of `floor_seen`
+    wall : inverse range of the likeliest wall, and how much it carries, as of `walls_seen`
     pose : the pose's share of sigma
     wider : (7, H, 2H), as `Judged.wider`, of what was measured
     """
@@ -66,6 +69,8 @@ class Opinions:
     frames: Evidence
     before: tuple[Map, Map, Map, Map]
     fused: tuple[Map, Map, Map]
+    floor: Map
+    wall: tuple[Map, Map]
     pose: Map
     wider: NDArray[np.float32]
 
@@ -84,8 +89,9 @@ def _differs(rho: np.float32, level: np.float32,
 
 @fast_kernel
 def _input(view: Image8, measured: tuple[Map, ...], frames: Evidence, before: tuple[Map, ...],
-           fused: tuple[Map, ...], wider: NDArray[np.float32], pixel: np.float32, r: int, c: int,
-           n: int, x: Map, p: int) -> None:  # pragma: no cover - compiled
+           fused: tuple[Map, ...], floor: Map, wall: tuple[Map, ...],
+           wider: NDArray[np.float32], pixel: np.float32, r: int, c: int, n: int, x: Map,
+           p: int) -> None:  # pragma: no cover - compiled
     """Column p of `x`, of pixel (r, c), the n-th of its four, before logarithms."""
     one, nothing = np.float32(1), np.float32(NOTHING)
     rho, old, both = measured[0][r, c], before[0][r, c], fused[0][r, c]
@@ -112,12 +118,17 @@ def _input(view: Image8, measured: tuple[Map, ...], frames: Evidence, before: tu
     for k in range(3):
         x[56 + 4 * k + n, p] = _share(wider[k, r, c], unit)
         x[72 + 4 * k + n, p] = _share(wider[4 + k, r, c], max(other, pixel))
+    seen = floor[r, c] > 0
+    x[84 + n, p] = one if seen else np.float32(0)
+    x[88 + n, p] = _differs(floor[r, c], level, pixel) if seen else one
+    x[92 + n, p] = wall[1][r, c]
+    x[96 + n, p] = _differs(wall[0][r, c], level, pixel) if wall[0][r, c] > 0 else one
 
 
 @fast_kernel
 def _input_rows(first: int, last: int, view: Image8, measured: tuple[Map, ...], frames: Evidence,
-                before: tuple[Map, ...], fused: tuple[Map, ...], wider: NDArray[np.float32],
-                sine: Map, scale: Map,
+                before: tuple[Map, ...], fused: tuple[Map, ...], floor: Map,
+                wall: tuple[Map, ...], wider: NDArray[np.float32], sine: Map, scale: Map,
                 out: NDArray[np.float32]) -> None:  # pragma: no cover - compiled
     """Rows of `out` (1, CHANNELS, …): on round the sphere, at the end as the last."""
     height, width = view.shape
@@ -128,8 +139,9 @@ def _input_rows(first: int, last: int, view: Image8, measured: tuple[Map, ...], 
                 for n in range(4):
                     r = min(2 * i + (n >> 1), height - 1)
                     c = (2 * (start + p - ROUND) + (n & 1)) % width
-                    _input(view, measured, frames, before, fused, wider, scale[0], r, c, n, x, p)
-                    x[84, p], x[85, p] = sine[r, c], scale[1]
+                    _input(view, measured, frames, before, fused, floor, wall, wider, scale[0], r,
+                           c, n, x, p)
+                    x[100, p], x[101, p] = sine[r, c], scale[1]
             logarithms(x, _LOGARITHMS)
             for k in _DIFFERENCES:
                 for p in range(BLOCK):
@@ -171,8 +183,8 @@ def inputs(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
     shortest, longest = baselines
     scale = np.array([pixel_of(height, longest), shortest / longest], np.float32)
     rows_in_parallel(_input_rows, size[0], view, opinions.measured, opinions.frames,
-                     opinions.before, opinions.fused, opinions.wider, _sine(height, direction),
-                     scale, out)
+                     opinions.before, opinions.fused, opinions.floor, opinions.wall,
+                     opinions.wider, _sine(height, direction), scale, out)
     return out
 
 
@@ -192,38 +204,33 @@ def _near_by(rho: np.float32, baseline: np.float32) -> bool:  # pragma: no cover
 
 
 @fast_kernel
-def _bound(rho: np.float32, baseline: np.float32,
-           bounds: Map) -> np.float32:  # pragma: no cover - compiled
-    if _near_by(rho, baseline):
-        return np.float32(bounds[0])
-    far = rho * max(baseline * np.float32(_FAR), np.float32(_FAR_M)) < 1
-    return np.float32(bounds[2] if far else bounds[1])
-
-
-@fast_kernel
 def _chosen(told: NDArray[np.float32], measured: Map, before: tuple[Map, ...],
-            fused: tuple[Map, ...], other: Map, i: int,
+            fused: tuple[Map, ...], others: tuple[Map, ...], i: int,
             j: int) -> np.float32:  # pragma: no cover - compiled
     best, most, nothing = measured[i, j], told[3, i, j], np.float32(NOTHING)
     if before[1][i, j] < nothing and told[4, i, j] > most:
         best, most = before[0][i, j], told[4, i, j]
     if fused[1][i, j] < nothing and told[5, i, j] > most:
         best, most = fused[0][i, j], told[5, i, j]
-    return np.float32(other[i, j] if told[6, i, j] > most else best)
+    for n in range(len(others)):  # a floor or wall where there is one
+        if told[6 + n, i, j] > most and (n == 0 or others[n][i, j] > 0):
+            best, most = others[n][i, j], told[6 + n, i, j]
+    return np.float32(best)
 
 
 @fast_kernel
 def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tuple[Map, ...],
                 frames: Evidence, before: tuple[Map, ...], fused: tuple[Map, ...],
-                other: Map, pose: Map, scale: Map, bounds: Map, rho: Map,
+                others: tuple[Map, ...], pose: Map, scale: Map, bounds: Map, rho: Map,
                 sigma: Map) -> None:  # pragma: no cover - compiled
-    """scale : inverse range of a pixel, shortest baseline, share of the 95th percentile, inverse
-    range of what is told to be free; bounds : logits of being off, as of _OFF
+    """others : what was passed over, floor, wall; scale : inverse range of a pixel, shortest
+    baseline, share of the 95th percentile, inverse range of what is told to be free; bounds :
+    logits of _OFF, _OFF_FREE and _SKY
     """
     nothing, least, pixel = np.float32(NOTHING), np.float32(LEAST), scale[0]
     for i in range(first, last):
         for j in range(rho.shape[1]):
-            best = _chosen(told, measured[0], before, fused, other, i, j)
+            best = _chosen(told, measured[0], before, fused, others, i, j)
             unit = max(best, pixel)
             nearer = np.exp(told[2, i, j]) - least
             hides = nearer > np.float32(_NEARER) and _near_by(best + nearer * unit, scale[1])
@@ -231,8 +238,10 @@ def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tupl
                 measured[0][i, j] > np.float32(_BEFORE) * best)
             own = likely_error(told, 0, i, j, scale[2]) * unit
             spread = np.sqrt(own * own + pose[i, j] * pose[i, j])
-            sure = told[7, i, j] <= _bound(best, scale[1], bounds)
-            sure &= told[7, i, j] <= bounds[3] or not beyond(best, spread, scale[3])
+            off, sky = told[9, i, j], told[10, i, j]
+            sure = off <= bounds[0]
+            sure &= off <= bounds[1] or not beyond(best, spread, scale[3])
+            sure &= sky <= bounds[2] or not _near_by(best, scale[1])
             rho[i, j], sigma[i, j] = best, nothing
             if sure and not hides and frames[i, j] >= 0:
                 sigma[i, j] = spread
@@ -244,11 +253,12 @@ def _logits(*probabilities: float) -> Map:
 
 
 def told(x: NDArray[np.float32], height: int) -> NDArray[np.float32]:
-    """The network's outputs, float32 (8, H, 2H): logarithms of the 68th and 95th percentile of the
-    error of what is chosen and of the 98th of how much nearer the truth may be, as shares of the
-    inverse range (at least of `pixel_of`), with LEAST added; four by which what was measured,
-    remembered, both as one, or what was passed over is chosen; and the logit of the probability
-    that it is off by over a tenth of its inverse range.
+    """The network's outputs, float32 (11, H, 2H): logarithms of the 68th and 95th percentile of
+    the error of what is chosen and of the 98th of how much nearer the truth may be, as shares of
+    the inverse range (at least of `pixel_of`), with LEAST added; six by which what was measured,
+    remembered, both as one, what was passed over, the floor, or the wall is chosen; and the logits
+    of the probabilities that it is off by over a tenth of its inverse range, and that only sky is
+    there.
     """
     whole = of_each_pixel(interior(_network()(x), height), _TOLD)
     return np.ascontiguousarray(whole[:, :height])
@@ -265,6 +275,7 @@ def judged(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
     scale = np.array([pixel_of(len(view), baselines[1]), baselines[0], np.exp(-_TAIL), farthest],
                      np.float32)
     rows_in_parallel(_judge_rows, len(rho), outputs, opinions.measured, opinions.frames,
-                     opinions.before, opinions.fused, opinions.wider[3], opinions.pose, scale,
-                     _logits(_OFF, _OFF_FARTHER, _OFF_FAR, _OFF_FREE), rho, sigma)
+                     opinions.before, opinions.fused,
+                     (opinions.wider[3], opinions.floor, opinions.wall[0]), opinions.pose, scale,
+                     _logits(_OFF, _OFF_FREE, _SKY), rho, sigma)
     return rho, sigma

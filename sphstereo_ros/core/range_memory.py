@@ -17,16 +17,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .floor import Floats, floor_plane, floor_seen
 from .frames import FrameKey, Image8, Reference, RelativePose
 from .history import PoseHistory
 from .inverse_range import NOTHING, _grid_angles
 from .jit import fast_kernel, kernel, rows_in_parallel
 from .joint import Measurement, in_steps
 from .judgement import Evidence
-from .memory_judge import Opinions, judged
+from .memory_judge import Opinions, judged, pixel_of
 from .reliability import NEAR_BY
+from .walls import walls_seen
 from .warp import Map, _arctan2
 
+_DOWN = np.array([0.0, 1.0, 0.0])
 _MOST = 6.0  # evidence
 _CONTRADICTED, _UNCONFIRMED, _UNTOLD = 2.0, 1.0, 0.3  # what a frame takes away of it
 _DOUBTED = 3.0  # evidence is no more than that where the newest frame is not believed
@@ -176,11 +179,14 @@ class RangeMemory:
 
     seconds : how long what nothing confirms is kept at most
     farthest : range, m, confidently beyond which all is told to be free, and has to be surer
+    down : (3,) unit vector, the vehicle's, optical frame
     """
 
-    def __init__(self, seconds: float, farthest: float = math.inf) -> None:
+    def __init__(self, seconds: float, farthest: float = math.inf,
+                 down: Floats = _DOWN) -> None:
         self._seconds = seconds
         self._farthest = farthest
+        self._down = down
         self._history = PoseHistory()
         self._key: FrameKey | None = None
         self._kept: Remembered | None = None
@@ -207,9 +213,12 @@ class RangeMemory:
         self._key, self._kept, self._metric = key, moved, metric
         self._frames += 1
         if view is not None and new.wider is not None and self._frames > 1:
+            baselines = [in_steps(r.pose).baseline for r in references]
             opinions = Opinions((new.rho, new.sigma, new.other, new.told), frames, before,
-                                (moved.rho, moved.sigma, moved.evidence), new.pose, new.wider)
-            return Remembered(*self._judged(view, opinions, references), moved.evidence)
+                                (moved.rho, moved.sigma, moved.evidence),
+                                *self._surfaces(moved, max(baselines)), new.pose, new.wider)
+            return Remembered(*self._judged(view, opinions, references[0].pose.direction,
+                                            (min(baselines), max(baselines))), moved.evidence)
         enough = (moved.evidence >= min(self._frames, _PUBLISHED)) & (frames >= 0)
         shortest = min(in_steps(r.pose).baseline for r in references)
         near_by = moved.rho * np.float32(NEAR_BY * shortest) > 1
@@ -217,12 +226,18 @@ class RangeMemory:
         return Remembered(moved.rho, np.where(enough, moved.sigma, np.float32(NOTHING)),
                           moved.evidence)
 
-    def _judged(self, view: Image8, opinions: Opinions, references: tuple[Reference, ...],
-                ) -> tuple[Map, Map]:
+    def _surfaces(self, known: Remembered, longest: float) -> tuple[Map, tuple[Map, Map]]:
+        """The floor, and the walls and how much they carry; longest : baseline, m."""
+        plane = floor_plane(known.rho, known.sigma, self._down)
+        floor = floor_seen(plane, len(known.rho))
+        up = self._down if plane is None else plane / np.linalg.norm(plane)
+        return floor, walls_seen(known.rho, known.sigma, floor, up,
+                                 float(pixel_of(len(floor), longest)))
+
+    def _judged(self, view: Image8, opinions: Opinions, direction: Floats,
+                baselines: tuple[float, float]) -> tuple[Map, Map]:
         """The likeliest inverse range and its sigma."""
-        baselines = [in_steps(r.pose).baseline for r in references]
-        return judged(view, opinions, references[0].pose.direction,
-                      (min(baselines), max(baselines)),
+        return judged(view, opinions, direction, baselines,
                       1 / self._farthest if self._metric else 0.0)
 
     def forget(self, where: NDArray[np.bool_]) -> None:

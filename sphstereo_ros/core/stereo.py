@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from .config import Config
+from .floor import floor_plane, under_floor
 from .frames import (
     AlignedWindow,
     Drop,
@@ -22,7 +23,7 @@ from .islands import far_islands
 from .joint import JointMatcher
 from .match_judge import judged_matcher
 from .matching import matcher, stereo_grid
-from .moving import floor_plane, moving_parts, under_floor
+from .moving import moving_parts
 from .pair_matching import PairMatcher, with_cones
 from .range_memory import RangeMemory
 from .rig import Rig
@@ -52,8 +53,12 @@ class SphericalStereo:
             self._pair = PairMatcher(config.stereo.matcher, self._match,
                                      config.baseline.relative_sigma)
         self._rig = Rig(config.pairing.mode == 'binocular')
-        self._memory = RangeMemory(config.stereo.memory, config.range.maximum)
+        self._down = -mount(config.camera).rotation[2]  # the vehicle's, optical frame
+        self._memory = self._new_memory()
         self._mask = mask
+
+    def _new_memory(self) -> RangeMemory:
+        return RangeMemory(self.config.stereo.memory, self.config.range.maximum, self._down)
 
     def remember_in(self, memory: RangeMemory) -> None:
         """Use another memory, which begins anew."""
@@ -73,7 +78,7 @@ class SphericalStereo:
             top = Reference(Frame(FrameKey(0, 'top'), noise), pose)
             self.process(AlignedWindow(frames[1], (top, Reference(frames[0], pose))))
             self._rig = Rig(binocular=True)
-        self._memory = RangeMemory(self.config.stereo.memory, self.config.range.maximum)
+        self._memory = self._new_memory()
         nothing = np.zeros(noise.shape, np.float32)
         under_floor(nothing, nothing, np.zeros(3))  # noise has no floor
 
@@ -112,8 +117,7 @@ class SphericalStereo:
 
     def _above_floor(self, estimate: InverseRange) -> InverseRange:
         """Nothing at rest lies under the floor: what seems to is a reflection in it."""
-        plane = floor_plane(estimate.rho, estimate.sigma,
-                            -mount(self.config.camera).rotation[2])
+        plane = floor_plane(estimate.rho, estimate.sigma, self._down)
         if plane is not None:
             estimate.sigma[under_floor(estimate.rho, estimate.sigma, plane) != 0] = NOTHING
         return estimate
@@ -125,8 +129,7 @@ class SphericalStereo:
         fused = self._memory.fused(window.current.key, window.references, measured,
                                    None if mask is None else mask != 0,
                                    window.current.image)
-        down = -mount(self.config.camera).rotation[2]
-        wrong, moving = moving_parts(fused, measured, down, metric=window.is_metric)
+        wrong, moving = moving_parts(fused, measured, self._down, metric=window.is_metric)
         if mask is not None:
             moving[mask != 0] = 0
         self._memory.forget(wrong)
