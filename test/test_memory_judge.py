@@ -137,6 +137,26 @@ def test_what_may_be_only_sky_is_not_told_near_by(monkeypatch, baselines, sky, k
     assert ((sigma < NOTHING) == known).all()
 
 
+@pytest.mark.parametrize(('choices', 'nearer', 'known'), [
+    ((0, 0, 0, 0, 1), 0.28, True), ((0, 0, 0, 0, 1), 0.32, False), ((1, 0, 0), 0.32, True)])
+def test_the_floor_is_not_told_where_something_may_stand_on_it(monkeypatch, choices, nearer,
+                                                               known):
+    _, sigma = told(monkeypatch, Tells(0.1, choices, nearer=nearer), opinions())
+    assert ((sigma < NOTHING) == known).all()
+
+
+@pytest.mark.parametrize(('measured', 'choices', 'known'), [
+    (0.95 * FLOOR / 1.3, (0, 0, 0, 0, 1), False), (1.05 * FLOOR / 1.3, (0, 0, 0, 0, 1), True),
+    (0.95 * FLOOR / 1.3, (1, 0, 0), True)])
+def test_the_floor_is_not_told_where_something_is_seen_beneath(monkeypatch, measured, choices,
+                                                               known):
+    """A mirror, or what moves along and has no parallax."""
+    given = opinions()
+    given.measured[0][:] = measured
+    _, sigma = told(monkeypatch, Tells(0.1, choices), given)
+    assert ((sigma < NOTHING) == known).all()
+
+
 @pytest.mark.parametrize('near', [True, False])
 def test_where_something_may_be_much_nearer_nothing_is_told_near_by(monkeypatch, near):
     given = opinions()

@@ -44,7 +44,11 @@ _TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile ma
 # Probabilities of being off by over a tenth with which it is told, and told to be free.
 _OFF, _OFF_FREE = 0.85, 0.1
 _SKY = 0.05  # probability that only sky is there with which nothing is told near by
-_NEARER = 0.7  # share by which something may be nearer with which nothing is told near by
+# Shares by which something may be nearer with which nothing is told near by, and not the floor,
+# which what stands low on it, or moves, is easily taken for.
+_NEARER, _NEARER_FLOOR = 0.7, 0.3
+# Times as far as the floor that the newest frame sees what a mirror shows, or moves along.
+_BENEATH = 1.3
 _NEAR_M = 10.0  # m: what is nearer is near by, however slowly the camera moves
 _BEFORE = 1.3  # times as far away as what the newest frame is believed to see near by
 
@@ -219,6 +223,22 @@ def _chosen(told: NDArray[np.float32], measured: Map, before: tuple[Map, ...],
 
 
 @fast_kernel
+def _may_hide(best: np.float32, nearer: np.float32, unit: np.float32, measured: np.float32,
+              frames: np.int8, floor: np.float32,
+              baseline: np.float32) -> bool:  # pragma: no cover - compiled
+    """Whether what would be told may hide something near.
+
+    nearer : inverse range by which the truth may be nearer; frames : of what was measured
+    """
+    on_floor = best > 0 and best == floor
+    hides = frames < 0 or (on_floor and measured * np.float32(_BENEATH) < best)
+    hides |= _near_by(best + nearer, baseline) and (
+        nearer > np.float32(_NEARER_FLOOR if on_floor else _NEARER) * unit)
+    before = frames > 0 and _near_by(measured, baseline)
+    return bool(hides or (before and measured > np.float32(_BEFORE) * best))
+
+
+@fast_kernel
 def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tuple[Map, ...],
                 frames: Evidence, before: tuple[Map, ...], fused: tuple[Map, ...],
                 others: tuple[Map, ...], pose: Map, scale: Map, bounds: Map, rho: Map,
@@ -232,10 +252,9 @@ def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tupl
         for j in range(rho.shape[1]):
             best = _chosen(told, measured[0], before, fused, others, i, j)
             unit = max(best, pixel)
-            nearer = np.exp(told[2, i, j]) - least
-            hides = nearer > np.float32(_NEARER) and _near_by(best + nearer * unit, scale[1])
-            hides |= frames[i, j] > 0 and _near_by(measured[0][i, j], scale[1]) and (
-                measured[0][i, j] > np.float32(_BEFORE) * best)
+            nearer = (np.exp(told[2, i, j]) - least) * unit
+            hides = _may_hide(best, nearer, unit, measured[0][i, j], frames[i, j],
+                              others[1][i, j], scale[1])
             own = likely_error(told, 0, i, j, scale[2]) * unit
             spread = np.sqrt(own * own + pose[i, j] * pose[i, j])
             off, sky = told[9, i, j], told[10, i, j]
@@ -243,7 +262,7 @@ def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tupl
             sure &= off <= bounds[1] or not beyond(best, spread, scale[3])
             sure &= sky <= bounds[2] or not _near_by(best, scale[1])
             rho[i, j], sigma[i, j] = best, nothing
-            if sure and not hides and frames[i, j] >= 0:
+            if sure and not hides:
                 sigma[i, j] = spread
 
 
