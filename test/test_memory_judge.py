@@ -137,12 +137,17 @@ def test_what_may_be_only_sky_is_not_told_near_by(monkeypatch, baselines, sky, k
     assert ((sigma < NOTHING) == known).all()
 
 
-@pytest.mark.parametrize(('choices', 'nearer', 'known'), [
-    ((0, 0, 0, 0, 1), 0.28, True), ((0, 0, 0, 0, 1), 0.32, False), ((1, 0, 0), 0.32, True)])
-def test_the_floor_is_not_told_where_something_may_stand_on_it(monkeypatch, choices, nearer,
+@pytest.mark.parametrize(('distance', 'nearer', 'known'), [
+    (8.0, 0.28, True), (8.0, 0.32, False), (50.0, 0.48, True), (50.0, 0.52, False)])
+def test_the_floor_is_not_told_where_something_may_stand_on_it(monkeypatch, distance, nearer,
                                                                known):
-    _, sigma = told(monkeypatch, Tells(0.1, choices, nearer=nearer), opinions())
+    given = opinions()
+    given.measured[0][:] = given.wider[3] = 0.99 / distance
+    given.floor[:] = 1 / distance
+    _, sigma = told(monkeypatch, Tells(0.1, (0, 0, 0, 0, 1), nearer=nearer), given)
     assert ((sigma < NOTHING) == known).all()
+    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), nearer=nearer), given)
+    assert (sigma < NOTHING).all()
 
 
 @pytest.mark.parametrize(('measured', 'choices', 'known'), [

@@ -49,7 +49,10 @@ _FRAMES = 14
 _JOBS = (('street', 12, None), ('street', 13, None), ('takeoff', 14, None),
          ('street', 16, 'traffic'), ('street', 17, None), ('street', 18, 'occlusion'),
          ('street', 19, None), ('street', 22, None), ('street', 24, 'low_light'),
-         ('takeoff', 26, None))
+         ('takeoff', 26, None),
+         *(('street', seed, None) for seed in (401, 403, 404, 406, 407, 409, 410, 412, 413, 416)),
+         ('street', 405, 'traffic'), ('street', 408, 'traffic'), ('takeoff', 411, None),
+         ('street', 417, 'occlusion'), ('street', 421, 'wall'))
 _HEIGHT = 960
 # Frames back of the references, the first frame that is measured, those that are kept, and whether
 # at half the size.

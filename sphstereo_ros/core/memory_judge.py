@@ -44,9 +44,9 @@ _TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile ma
 # Probabilities of being off by over a tenth with which it is told, and told to be free.
 _OFF, _OFF_FREE = 0.85, 0.1
 _SKY = 0.05  # probability that only sky is there with which nothing is told near by
-# Shares by which something may be nearer with which nothing is told near by, and not the floor,
-# which what stands low on it, or moves, is easily taken for.
-_NEARER, _NEARER_FLOOR = 0.7, 0.3
+# Shares by which something may be nearer with which nothing is told near by; and with which the
+# floor is not, near by and anywhere: what is thin before it, or moves, is easily taken for it.
+_NEARER, _NEARER_FLOOR, _NEARER_FAR_FLOOR = 0.7, 0.3, 0.5
 # Times as far as the floor that the newest frame sees what a mirror shows, or moves along.
 _BENEATH = 1.3
 _NEAR_M = 10.0  # m: what is nearer is near by, however slowly the camera moves
@@ -232,6 +232,7 @@ def _may_hide(best: np.float32, nearer: np.float32, unit: np.float32, measured: 
     """
     on_floor = best > 0 and best == floor
     hides = frames < 0 or (on_floor and measured * np.float32(_BENEATH) < best)
+    hides |= on_floor and nearer > np.float32(_NEARER_FAR_FLOOR) * unit
     hides |= _near_by(best + nearer, baseline) and (
         nearer > np.float32(_NEARER_FLOOR if on_floor else _NEARER) * unit)
     before = frames > 0 and _near_by(measured, baseline)
