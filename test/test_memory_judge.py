@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sphstereo_ros.core import memory_judge
+from sphstereo_ros.core import memory_judge, range_memory
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.floor import floor_seen
 from sphstereo_ros.core.frames import (
@@ -16,6 +16,7 @@ from sphstereo_ros.core.frames import (
     AlignedWindow,
     Frame,
     FrameKey,
+    RangeImage,
     Reference,
     RelativePose,
 )
@@ -387,15 +388,30 @@ def test_it_only_reads(monkeypatch):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
 
 
-@pytest.mark.parametrize('off', [0.05, 0.3])
-def test_free_is_what_lies_beyond_the_parameter(monkeypatch, off):
+def drive(stereo: SphericalStereo) -> RangeImage:
     """Nothing moves while the camera goes 0.3 m a frame."""
-    monkeypatch.setattr(memory_judge, '_network', lambda: Tells(1e-3, (1, 0, 0), off=off))
-    stereo = SphericalStereo(resolve({'range.max': 5.0}))
     noise = np.random.default_rng(3).integers(0, 255, (128, 256), np.uint8)
     frames = [Frame(FrameKey(33_333_333 * k, 'camera'), noise) for k in range(3)]
     pose = RelativePose(np.eye(3), np.array([0.0, 0.0, -0.3]), 1e-12 * np.eye(6))
     for before, current in pairwise(frames):
         found = stereo.process(AlignedWindow(current, (Reference(before, pose),)))
-    free = np.isposinf(found.range).mean()
+    assert isinstance(found, RangeImage)
+    return found
+
+
+@pytest.mark.parametrize('off', [0.05, 0.3])
+def test_free_is_what_lies_beyond_the_parameter(monkeypatch, off):
+    monkeypatch.setattr(memory_judge, '_network', lambda: Tells(1e-3, (1, 0, 0), off=off))
+    free = np.isposinf(drive(SphericalStereo(resolve({'range.max': 5.0}))).range).mean()
     assert free > 0.2 if off < 0.1 else free == 0
+
+
+def test_down_is_as_the_camera_is_mounted(monkeypatch):
+    """A camera that looks 0.3 rad down sees the vehicle's down turned forward."""
+    asked = []
+    monkeypatch.setattr(range_memory, 'floor_plane', lambda *given: asked.append(given[2]))
+    stereo = SphericalStereo(resolve({'camera.mount.pitch': 0.3}))
+    drive(stereo)
+    assert asked
+    for down in asked:
+        np.testing.assert_allclose(down, [0, np.cos(0.3), np.sin(0.3)], atol=1e-9)
