@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from .config import Config
-from .floor import floor_plane, under_floor
+from .floor import floor_plane, floor_seen, under_floor
 from .frames import (
     AlignedWindow,
     Drop,
@@ -28,6 +28,7 @@ from .pair_matching import PairMatcher, with_cones
 from .range_memory import RangeMemory
 from .rig import Rig
 from .rotations import mount
+from .walls import walls_seen
 from .warp import aligned_pair
 
 
@@ -80,7 +81,9 @@ class SphericalStereo:
             self._rig = Rig(binocular=True)
         self._memory = self._new_memory()
         nothing = np.zeros(noise.shape, np.float32)
-        under_floor(nothing, nothing, np.zeros(3))  # noise has no floor
+        under_floor(nothing, nothing, np.zeros(3))  # noise has no floor, and no walls
+        floor = floor_seen(self._down, len(noise))
+        walls_seen(nothing + 1, nothing, floor, self._down, 0.0)
 
     def process(self, window: AlignedWindow) -> RangeImage | Drop:
         """Range and sigma on the current frame's grid.
