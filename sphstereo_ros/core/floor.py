@@ -71,8 +71,8 @@ def _seen_downward(rho: Map, sigma: Map,
 
 
 @fast_kernel
-def _at(plane: Map, cos_lat: np.float32, sin_lat: np.float32, cos_lon: np.float32,
-        sin_lon: np.float32) -> np.float32:  # pragma: no cover - compiled
+def plane_at(plane: Map, cos_lat: np.float32, sin_lat: np.float32, cos_lon: np.float32,
+             sin_lon: np.float32) -> np.float32:  # pragma: no cover - compiled
     """Inverse range of the plane in that direction."""
     return np.float32(plane[0] * cos_lat * sin_lon - plane[1] * sin_lat
                       + plane[2] * cos_lat * cos_lon)
@@ -84,7 +84,7 @@ def _under_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map,
                 out: Image8) -> None:  # pragma: no cover - compiled
     for i in range(first, last):
         for j in range(cos_lon.size):
-            on_floor = _at(plane, cos_lat[i], sin_lat[i], cos_lon[j], sin_lon[j])
+            on_floor = plane_at(plane, cos_lat[i], sin_lat[i], cos_lon[j], sin_lon[j])
             limit = (on_floor - least) / np.float32(_HEIGHT)
             out[i, j] = np.uint8(
                 255 if rho[i, j] + np.float32(_CERTAIN) * sigma[i, j] < limit else 0)
@@ -107,8 +107,8 @@ def _floor_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map,
                 plane: Map, out: Map) -> None:  # pragma: no cover - compiled
     for i in range(first, last):
         for j in range(cos_lon.size):
-            out[i, j] = max(_at(plane, cos_lat[i], sin_lat[i], cos_lon[j], sin_lon[j]),
-                            np.float32(0))
+            out[i, j] = max(np.float32(0), plane_at(plane, cos_lat[i], sin_lat[i], cos_lon[j],
+                                                    sin_lon[j]))
 
 
 def floor_seen(plane: Floats | None, height: int) -> Map:

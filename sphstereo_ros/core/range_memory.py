@@ -212,16 +212,15 @@ class RangeMemory:
                          alike, moved.rho, moved.sigma, moved.evidence)
         self._key, self._kept, self._metric = key, moved, metric
         self._frames += 1
+        baselines = [in_steps(r.pose).baseline for r in references]
         if view is not None and new.wider is not None and self._frames > 1:
-            baselines = [in_steps(r.pose).baseline for r in references]
             opinions = Opinions((new.rho, new.sigma, new.other, new.told), frames, before,
                                 (moved.rho, moved.sigma, moved.evidence),
                                 *self._surfaces(moved, max(baselines)), new.pose, new.wider)
             return Remembered(*self._judged(view, opinions, references[0].pose.direction,
                                             (min(baselines), max(baselines))), moved.evidence)
         enough = (moved.evidence >= min(self._frames, _PUBLISHED)) & (frames >= 0)
-        shortest = min(in_steps(r.pose).baseline for r in references)
-        near_by = moved.rho * np.float32(NEAR_BY * shortest) > 1
+        near_by = moved.rho * np.float32(NEAR_BY * min(baselines)) > 1
         enough &= ~near_by | (moved.sigma < np.float32(_UNSURE) * moved.rho)
         return Remembered(moved.rho, np.where(enough, moved.sigma, np.float32(NOTHING)),
                           moved.evidence)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .floor import plane_at
 from .inverse_range import _grid_angles
 from .jit import fast_kernel, kernel, rows_in_parallel
 from .warp import Map
@@ -126,8 +127,7 @@ def _wall_rows(first: int, last: int, cos_lat: Map, sin_lat: Map, cos_lon: Map, 
         for j in range(cos_lon.size):
             c = min(j // step, which.shape[1] - 1)
             plane = planes[which[r, c]]
-            there = (plane[0] * cos_lat[i] * sin_lon[j] - plane[1] * sin_lat[i]
-                     + plane[2] * cos_lat[i] * cos_lon[j])
+            there = plane_at(plane, cos_lat[i], sin_lat[i], cos_lon[j], sin_lon[j])
             carried = share[r, c] > np.float32(_SUPPORT) and there > 0
             rho[i, j] = there if carried else np.float32(0)
             support[i, j] = share[r, c] if carried else np.float32(0)
