@@ -40,9 +40,9 @@ from sphstereo_ros.core.stereo import SphericalStereo
 HEIGHT = 32
 AHEAD = np.array([0.0, 0.0, 1.0])
 BASELINES = (0.3, 3.0)
-MEASURED, REMEMBERED, BOTH, PASSED_OVER, FLOOR, WALL = (
-    0.1, 0.08, 0.09, 0.085, 0.12, 0.078)  # 1/m
-CARRIES = 0.4
+MEASURED, REMEMBERED, BOTH, PASSED_OVER, FLOOR, WALL, FARTHER, NEARER = (
+    0.1, 0.08, 0.09, 0.085, 0.12, 0.078, 0.0775, 0.15)  # 1/m
+CARRIES, CLOSE, GREY = 0.4, (0.7, 0.3), (224, 128)
 WIDER = (0.012, 0.03, 0.02, PASSED_OVER, 0.014, 0.035, 0.025)  # 1/m
 PIXEL = pixel_of(HEIGHT, BASELINES[1])
 
@@ -60,6 +60,8 @@ def opinions(height: int = HEIGHT, *, remembered: bool = True, pose: float = 0.0
                     tuple(whole(v, height=height) for v in (both, 0.004, 5)),
                     whole(FLOOR, height=height),
                     (whole(WALL, height=height), whole(CARRIES, height=height)),
+                    np.stack([whole(v, height=height) for v in (
+                        FARTHER, CLOSE[0], GREY[0], NEARER, CLOSE[1], GREY[1])]),
                     whole(pose, height=height),
                     np.stack([whole(v, height=height) for v in WIDER]))
 
@@ -76,7 +78,7 @@ class Tells:
 
     def __init__(self, likely: float, choices: tuple[float, ...], off: float = 0.01,
                  nearer: float = 0.05, sky: float = 0.01) -> None:
-        choices = (*choices, *[-9.0] * (6 - len(choices)))
+        choices = (*choices, *[-9.0] * (8 - len(choices)))
         self.outputs = [*np.log(np.array([likely, likely, nearer]) + LEAST), *choices,
                         np.log(off / (1 - off)), np.log(sky / (1 - sky))]
 
@@ -93,7 +95,8 @@ def told(monkeypatch: pytest.MonkeyPatch, net: object, given: Opinions) -> tuple
 
 @pytest.mark.parametrize(('choices', 'rho'), [
     ((1, 0, 0), MEASURED), ((0, 1, 0), REMEMBERED), ((0, 0, 1), BOTH),
-    ((0, 0, 1, 2), PASSED_OVER), ((0, 0, 0, 1, 2), FLOOR), ((0, 0, 0, 0, 1, 2), WALL)])
+    ((0, 0, 1, 2), PASSED_OVER), ((0, 0, 0, 1, 2), FLOOR), ((0, 0, 0, 0, 1, 2), WALL),
+    ((0, 0, 0, 0, 0, 1, 2), FARTHER), ((0, 0, 0, 0, 0, 0, 1, 2), NEARER)])
 def test_the_likeliest_is_told_with_its_error(monkeypatch, choices, rho):
     found, sigma = told(monkeypatch, Tells(0.1, choices), opinions(pose=0.003))
     np.testing.assert_allclose(found, rho, rtol=1e-6)
@@ -114,6 +117,16 @@ def test_a_floor_or_wall_is_chosen_only_where_there_is_one(monkeypatch, choices,
     found, _ = told(monkeypatch, Tells(0.1, choices), given)
     np.testing.assert_allclose(found[:HEIGHT // 2], PASSED_OVER, rtol=1e-6)
     np.testing.assert_allclose(found[HEIGHT // 2:], surface, rtol=1e-6)
+
+
+@pytest.mark.parametrize('side', [0, 1])
+def test_what_is_beside_is_chosen_only_where_there_is_something(monkeypatch, side):
+    given = opinions()
+    given.beside[3 * side + 1, :HEIGHT // 2] = 0
+    given.beside[3 * side] = 0  # the sky
+    found, _ = told(monkeypatch, Tells(0.1, (0, 0, 0, 1, 0, 0, *[0] * side, 2)), given)
+    np.testing.assert_allclose(found[:HEIGHT // 2], PASSED_OVER, rtol=1e-6)
+    assert not found[HEIGHT // 2:].any()
 
 
 def test_the_error_is_a_share_of_a_pixel_at_least(monkeypatch):
@@ -249,14 +262,16 @@ def test_what_the_network_sees():
               np.log((PASSED_OVER + PIXEL) / (0.2 + PIXEL)),
               *np.log(0.001 + np.array(WIDER[4:]) / PASSED_OVER),
               1, np.log((FLOOR + PIXEL) / (0.2 + PIXEL)),
-              CARRIES, np.log((WALL + PIXEL) / (0.2 + PIXEL))]
-    np.testing.assert_allclose(inside[(slice(n, 100, 4), *at)], wanted, atol=1e-3)
+              CARRIES, np.log((WALL + PIXEL) / (0.2 + PIXEL)),
+              CLOSE[0], np.log((FARTHER + PIXEL) / (0.2 + PIXEL)), (224 - 192) / 64,
+              CLOSE[1], np.log((NEARER + PIXEL) / (0.2 + PIXEL)), (128 - 192) / 64]
+    np.testing.assert_allclose(inside[(slice(n, -2, 4), *at)], wanted, atol=1e-3)
     elsewhere = inside[0, 3, 4]
     assert elsewhere == pytest.approx(np.log(1 + 0.1 / PIXEL), abs=1e-3)
-    assert inside[101].mean() == pytest.approx(np.log(0.1), abs=1e-3)
+    assert inside[-1].mean() == pytest.approx(np.log(0.1), abs=1e-3)
     longitude = (np.arange(HEIGHT) + 0.75) / HEIGHT * 2 * np.pi - np.pi
     along = np.cos(longitude) * np.cos(1.5 / HEIGHT * np.pi)
-    np.testing.assert_allclose(inside[100, HEIGHT // 4], np.sqrt(1 - along**2), atol=1e-3)
+    np.testing.assert_allclose(inside[-2, HEIGHT // 4], np.sqrt(1 - along**2), atol=1e-3)
 
 
 def test_nothing_remembered_looks_like_nothing():
@@ -267,23 +282,23 @@ def test_nothing_remembered_looks_like_nothing():
     np.testing.assert_allclose(x[44:48], 0, atol=1e-3)
 
 
-def test_no_floor_and_no_wall_look_like_none():
+def test_no_floor_no_wall_and_nothing_beside_look_like_none():
     given = opinions()
-    given.floor[:], given.wall[0][:], given.wall[1][:] = 0, 0, 0
+    given.floor[:], given.wall[0][:], given.wall[1][:], given.beside[:] = 0, 0, 0, 0
     x = interior(inputs(view(), given, AHEAD, BASELINES), HEIGHT)[0]
-    np.testing.assert_allclose(x[THERE:THERE + 16], 0, atol=1e-3)
+    np.testing.assert_allclose(x[THERE:-2], 0, atol=1e-3)
 
 
 def test_it_goes_on_round_the_sphere():
     given = opinions()
     given.measured[0][:, :2] = 0.3
     x = inputs(view(), given, AHEAD, BASELINES)
-    np.testing.assert_array_equal(x[0, :100, :, ROUND], x[0, :100, :, ROUND + HEIGHT])
+    np.testing.assert_array_equal(x[0, :-2, :, ROUND], x[0, :-2, :, ROUND + HEIGHT])
     turned = opinions()
     turned.measured[0][:, 20:22] = 0.3
     turned = inputs(view(), turned, AHEAD, BASELINES)
-    np.testing.assert_array_equal(interior(turned, HEIGHT)[0, :100, :, 10],
-                                  interior(x, HEIGHT)[0, :100, :, 0])
+    np.testing.assert_array_equal(interior(turned, HEIGHT)[0, :-2, :, 10],
+                                  interior(x, HEIGHT)[0, :-2, :, 0])
 
 
 @settings(deadline=None, max_examples=25)
@@ -301,7 +316,8 @@ def test_whatever_it_sees_what_it_tells_is_one_of_them(height, seed):
                       some(-2, 6), some(0, 1)),
                      (some(0, 1), np.where(unknown[1], NOTHING, some(1e-6, 2)).astype(np.float32),
                       some(-2, 6)), np.maximum(some(-1, 1), 0),
-                     (np.maximum(some(-1, 1), 0), some(0, 1)), some(0, 0.1),
+                     (np.maximum(some(-1, 1), 0), some(0, 1)),
+                     np.maximum([some(-1, 1) for _ in range(6)], 0), some(0, 0.1),
                      np.stack([some(0, 2) if n != 3 else some(-0.1, 1) for n in range(7)]))
     grey = rng.integers(0, 256, shape).astype(np.uint8)
     x = inputs(grey, given, AHEAD, BASELINES)
@@ -310,7 +326,9 @@ def test_whatever_it_sees_what_it_tells_is_one_of_them(height, seed):
     assert rho.shape == sigma.shape == shape
     old, both = ((rho == m[0]) & (m[1] < NOTHING) for m in (given.before, given.fused))
     surface = np.logical_or(*((rho == m) & (m > 0) for m in (given.floor, given.wall[0])))
-    assert ((rho == given.measured[0]) | old | both | (rho == given.wider[3]) | surface).all()
+    near = np.logical_or(*((rho == given.beside[n]) & (given.beside[n + 1] > 0) for n in (0, 3)))
+    assert ((rho == given.measured[0]) | old | both | (rho == given.wider[3]) | surface
+            | near).all()
     assert ((sigma == NOTHING) | (sigma >= given.pose)).all()
     assert (sigma > 0).all()
 
@@ -374,6 +392,31 @@ def test_the_floor_is_that_of_what_is_known(monkeypatch, down):
             np.eye(3), pose)),), measured, None, view(height))
     wanted = carried if down[1] > 0 else np.where(measured.rho < 0, 0, measured.rho)
     np.testing.assert_allclose(found.rho[carried > 0.05], wanted[carried > 0.05], rtol=0.02)
+
+
+def test_what_is_beside_is_looked_for_from_what_is_known_or_else_was_measured(monkeypatch):
+    looked: list[np.ndarray] = []
+
+    def beside(rho: np.ndarray, sigma: np.ndarray, grey: np.ndarray,
+               pixel: float) -> np.ndarray:
+        looked.append(np.where(sigma < NOTHING, rho, -rho))
+        assert pixel == pytest.approx(pixel_of(HEIGHT, Drives.BASELINE))
+        np.testing.assert_array_equal(grey, view())
+        return np.zeros((6, *rho.shape), np.float32)
+    monkeypatch.setattr(range_memory, 'beside', beside)
+    monkeypatch.setattr(memory_judge, '_network', lambda: Tells(0.2, (0, 0, 9)))
+    memory = RangeMemory(0.45)
+    for k, (rho, left) in enumerate(((0.1, 1), (0.1, 1), (0.1, 1), (0.2, 0)), 1):
+        frames = whole(0, np.int8)  # what is on the right is never believed
+        frames[:, :HEIGHT] = left
+        measured = Measurement(whole(rho), whole(0.01), whole(rho), frames, whole(0.01),
+                               whole(0.003), wider=np.stack([whole(v) for v in WIDER]))
+        keys = [FrameKey(33_333_333 * n, 'camera') for n in (k - 1, k)]
+        memory.fused(keys[1], (Reference(Frame(keys[0], view()), RelativePose(
+            np.eye(3), np.array([0, 0, -Drives.BASELINE]))),), measured, None, view())
+    found = looked[-1]
+    np.testing.assert_allclose(found[:, 4:HEIGHT - 4], 0.1, rtol=0.01)
+    np.testing.assert_allclose(found[:, HEIGHT + 4:-4], -0.2, rtol=1e-6)
 
 
 def test_it_only_reads(monkeypatch):

@@ -8,9 +8,11 @@ import pytest
 from test_memory_judge import (
     AHEAD,
     BASELINES,
+    FARTHER,
     FLOOR,
     HEIGHT,
     MEASURED,
+    NEARER,
     PASSED_OVER,
     PIXEL,
     WALL,
@@ -28,7 +30,7 @@ from sphstereo_ros.bench.memory_judge import (
     patch_of,
     patches_of,
 )
-from sphstereo_ros.core.memory_judge import CHANNELS, THERE, pixel_of
+from sphstereo_ros.core.memory_judge import CHANNELS, PRESENT, THERE, pixel_of
 from sphstereo_ros.scenes.sequence import TruthFrame, render_sequence, save_sequence
 
 
@@ -46,7 +48,7 @@ def patch(distance: float, moving: bool = False) -> Patch:
 def test_a_patch_tells_how_far_each_is_from_the_truth():
     found = patch(8.0)
     true, *others = ((rho + PIXEL) / (MEASURED + PIXEL)
-                     for rho in (1 / 8, 0.08, 0.09, PASSED_OVER, FLOOR, WALL))
+                     for rho in (1 / 8, 0.08, 0.09, PASSED_OVER, FLOOR, WALL, FARTHER, NEARER))
     np.testing.assert_allclose(found.true, np.log(true), atol=1e-3)
     for n, other in enumerate(others):
         np.testing.assert_allclose(found.found[n], np.log(other), atol=1e-3)
@@ -60,9 +62,13 @@ def test_the_sky_is_a_truth_and_what_is_unknown_is_none():
     assert not patch(np.nan).weight.any()
 
 
-def test_of_what_moves_only_what_was_found_too_far_counts():
+def test_what_moves_and_was_found_too_near_is_taken_to_be_there():
+    """Whatever is farther is wrong, then."""
+    found, still = patch(12.0, moving=True), patch(12.0)
+    assert not found.true.any()
+    np.testing.assert_array_equal(found.weight, still.weight)
+    np.testing.assert_array_equal(patch(8.0, moving=True).true, patch(8.0).true)
     assert (patch(8.0, moving=True).weight > 0).all()
-    assert not patch(12.0, moving=True).weight.any()
 
 
 def test_far_things_count_more_and_near_ones_that_were_found_far():
@@ -75,10 +81,12 @@ def samples(rng: np.random.Generator) -> Patch:
     """Where grey is high, what was remembered is right, else what was measured; both are sure."""
     size = (64, 64)
     x = rng.normal(0, 0.1, (CHANNELS, *size)).astype(np.float32)
-    x[0:4], x[20:24] = 3.0, 0.0
+    x[0:4], x[20:24], x[48:52] = 3.0, 0.0, -2.0
+    for at in PRESENT:
+        x[at:at + 4] = 1.0
     x[20:24, :, 32:] = 1.0
     right = np.broadcast_to(np.arange(128) >= 64, (128, 128))
-    found = np.stack([np.full((128, 128), off) for off in (-0.3, 0.3, 0.4, 0.2, 0.5)])
+    found = np.stack([np.full((128, 128), off) for off in (-0.3, 0.3, 0.4, 0.2, 0.5, -0.5, 0.6)])
     true = np.where(right, -0.3, 0.0) + rng.normal(0, 0.01, (128, 128))
     maps = [m.astype(np.float16) for m in (found, true, np.ones((128, 128)))]
     return Patch(x.astype(np.float16), *maps)
@@ -93,7 +101,7 @@ def test_a_fit_chooses_and_tells_the_error():
     with torch.no_grad():
         x = torch.from_numpy(given.x.astype(np.float32))[None]
         out = torch.nn.functional.pixel_shuffle(DESIGN.forward(parts, x), 2)[0].numpy()
-    choice = out[3:9].argmax(0)
+    choice = out[3:11].argmax(0)
     inside = np.s_[8:-8, 8:56], np.s_[8:-8, 72:120]
     assert (choice[inside[0]] == 0).mean() > 0.9
     assert (choice[inside[1]] == 1).mean() > 0.9
@@ -116,6 +124,26 @@ def test_a_choice_that_is_too_far_costs_most():
     assert costs(0.0) < costs(-0.4) < costs(0.4) - 1.0
 
 
+@pytest.mark.parametrize(('choice', 'at'), [
+    (1, 24), (2, 48), (4, 84), (5, 92), (6, 100), (7, 112)])
+def test_what_is_not_there_is_no_choice(choice, at):
+    torch = pytest.importorskip('torch')
+    given = samples(np.random.default_rng(0))
+    found = torch.from_numpy(given.found.astype(np.float32))[None]
+    one = torch.ones(1, 1, 128, 128)
+
+    def costs(logit: float, *, there: bool) -> float:
+        x = torch.from_numpy(given.x.astype(np.float32))[None]
+        if not there:
+            x[:, at:at + 4] = 2.303 if choice == 2 else 0.0
+        out = torch.zeros(1, len(DESIGN.begin), 64, 64)
+        out[:, :12], out[:, 12:16] = np.log(0.01), 1.0
+        out[:, 12 + 4 * choice:16 + 4 * choice] = logit
+        return float(loss(out, x, found, 0.0 * one, one))
+    assert costs(9.0, there=True) > costs(-9.0, there=True) + 0.5
+    assert costs(9.0, there=False) == pytest.approx(costs(-9.0, there=False), abs=1e-5)
+
+
 @pytest.mark.parametrize('sky', [True, False])
 def test_it_costs_to_take_sky_for_something_or_something_for_sky(sky):
     torch = pytest.importorskip('torch')
@@ -128,7 +156,7 @@ def test_it_costs_to_take_sky_for_something_or_something_for_sky(sky):
     def costs(logit: float) -> float:
         out = torch.zeros(1, len(DESIGN.begin), 64, 64)
         out[:, :12] = np.log(0.01)
-        out[:, 40:] = logit
+        out[:, 48:] = logit
         return float(loss(out, x, found, (-level if sky else -0.2) * one, one))
     assert (costs(3.0) < costs(-3.0) - 2.0) == sky
     assert (costs(-3.0) < costs(3.0) - 2.0) == (not sky)

@@ -24,7 +24,9 @@ from sphstereo_ros.core.inverse_range import NOTHING
 from sphstereo_ros.core.memory_judge import (
     BLOCK,
     CHANNELS,
+    GREYS,
     LEVEL,
+    PRESENT,
     SIGMAS,
     THERE,
     VIEW,
@@ -61,7 +63,7 @@ _WINDOWS = (((1, 4, 7, 10), 4, (10, 12, 13), False), ((1,), 3, (6,), False),
 # Weights of what is 10 to 100 m away, of what of it is over 30 m away, and of what is near but was
 # found far.
 _RARE, _RARER, _TOO_FAR = 2.0, 1.5, 2.0
-_WIDTHS, _LAST = (24, 32, 48, 64), 24
+_WIDTHS, _LAST = (32, 64, 96, 128, 128), 32
 _BEGIN = -2.3  # logarithm of the error that it starts from
 _ROWS, _COLUMNS, _BATCH, _RATE = 160, 240, 3, 1.5e-3
 _TRUE = 0.02  # share of a sample of which the truth has to be known
@@ -76,10 +78,13 @@ _POSES, _POSE = 0.3, 0.05  # share of samples of which poses are unsure, and by 
 # by how much.
 _NO_SURFACE, _SURFACES, _SURFACE = 0.15, 0.2, 0.2
 
+_SURFACE_FOUND = 3  # of `Patch.found`, the floor, and the wall after it
+
+_NEVER, _UNKNOWN = -1e4, 2.3  # a logit; logarithm of sigma over inverse range
 _OFF, _RARELY = 0.1, -2.0  # share of the inverse range by which it is off, and a logit to begin
 _SKY = 0.05  # px of parallax of the longest baseline: with less nothing is there
 
-_OF_ERROR, _CHOSEN = len(PERCENTILES), 6
+_OF_ERROR, _CHOSEN = len(PERCENTILES), 8
 DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
                 [_BEGIN] * (4 * _OF_ERROR) + [0.0] * (4 * _CHOSEN) + [_RARELY] * 8,
                 deep=True)
@@ -89,11 +94,12 @@ DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
 class Patch:
     """What the network sees of a frame and should tell.
 
-    x : float16 (CHANNELS, rows, columns); found, true : float16 (5, 2 rows, 2 columns) and (2
+    x : float16 (CHANNELS, rows, columns); found, true : float16 (7, 2 rows, 2 columns) and (2
     rows, 2 columns), logarithms of how many times as large as measured the inverse range is that
-    was remembered, that both are as one, that was passed over, of floor and wall, and the true
-    one, a pixel of the longest baseline's parallax added to each; weight : the same, 0 where the
-    truth is unknown, or moves and is found too near
+    was remembered, that both are as one, that was passed over, of floor and wall, of what is
+    beside it, farther and nearer, and the true one, a pixel of the longest baseline's parallax
+    added to each; what moves and is measured too near is taken to be there; weight : the same, 0
+    where the truth is unknown
     """
 
     x: NDArray[np.float16]
@@ -117,10 +123,11 @@ def patch_of(truth: TruthFrame, view: Image8, opinions: Opinions, direction: NDA
              for rho, sigma, *_ in (opinions.before, opinions.fused)]
     found += [against(opinions.wider[3]), *(
         against(rho, rho > 0) for rho in (opinions.floor, opinions.wall[0]))]
+    found += [against(opinions.beside[n], opinions.beside[n + 1] > 0) for n in (0, 3)]
     wanted = against(np.nan_to_num(true))
     weight = np.isfinite(true) * _areas(height)
-    if truth.moving is not None:  # what moves seems near or far by its speed
-        weight *= ~truth.moving | (wanted > 0)
+    if truth.moving is not None:  # what moves seems near or far by its speed; near is safe
+        wanted[truth.moving & (wanted < 0)] = 0
     weight *= np.where((true > 0.01) & (true < 0.1), _RARE, 1)
     weight *= np.where((true > 0.01) & (true < 1 / 30), _RARER, 1)
     weight *= np.where((true > 0.1) & (wanted > np.log(1.5)), _TOO_FAR, 1)
@@ -195,9 +202,11 @@ def loss(out: Any, x: Any, found: Any, true: Any, weight: Any) -> Any:
     each = torch.cat([torch.zeros_like(true), found], 1)
     nearer = true - each
     wrong = nearer.abs().clamp(max=_WRONG) + _WORSE * (nearer > _FARTHER)
-    choices, doubt = told[:, _OF_ERROR:_OF_ERROR + _CHOSEN], told[:, _OF_ERROR + _CHOSEN:]
+    absent, doubt = ~_there(x), told[:, _OF_ERROR + _CHOSEN:]
+    choices, better = (m.masked_fill(absent, _NEVER) for m in (
+        told[:, _OF_ERROR:_OF_ERROR + _CHOSEN], -wrong / _DIFFERENCE))
     chosen = _CHOICE * torch.softmax(choices, 1) * wrong - _BETTER * torch.softmax(
-        -wrong / _DIFFERENCE, 1) * torch.log_softmax(choices, 1)
+        better, 1) * torch.log_softmax(choices, 1)
     likeliest = torch.exp(level + each.gather(1, choices.argmax(1, keepdim=True))) - 1
     pixels = torch.exp(level + true) - 1
     off = (pixels - likeliest) / likeliest.clamp(min=1)
@@ -208,18 +217,30 @@ def loss(out: Any, x: Any, found: Any, true: Any, weight: Any) -> Any:
             + (weight * (chosen.sum(1, keepdim=True) + doubted)).sum() / weight.sum())
 
 
+def _there(x: Any) -> Any:
+    """Which of what there is to choose from there is, (N, _CHOSEN, 2 rows, 2 columns)."""
+    import torch
+    from torch.nn import functional
+    remembered, *others = (functional.pixel_shuffle(x[:, n:n + 4], 2) > 0 for n in PRESENT)
+    known = functional.pixel_shuffle(x[:, SIGMAS[2]:SIGMAS[2] + 4], 2) < _UNKNOWN
+    always = torch.ones_like(known)
+    return torch.cat([always, remembered, known, always, *others], 1)
+
+
 def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, ...]:
     """A part of a patch, in another light, with less sure poses, or mirrored."""
     import torch
     x, maps = _part(patch, rng)
-    x[:, VIEW:VIEW + 4] = (x[:, VIEW:VIEW + 4] * float(np.exp(rng.normal(0, 0.25)))
-                           + float(rng.normal(0, 0.3))).clamp(-2, 2)
+    contrast = float(np.exp(rng.normal(0, 0.25)))
+    x[:, VIEW:VIEW + 4] = (x[:, VIEW:VIEW + 4] * contrast + float(rng.normal(0, 0.3))).clamp(-2, 2)
+    for at in GREYS:
+        x[:, at:at + 4] = (x[:, at:at + 4] * contrast).clamp(-2, 2)
     if rng.random() < _POSES:
         share = _POSE * float(rng.random())
         for at in SIGMAS:
             x[:, at:at + 4] = 0.5 * torch.log(torch.exp(2 * x[:, at:at + 4]) + share**2)
     for n in range(2):
-        _vary_surface(x[:, THERE + 8 * n:THERE + 8 * n + 8], maps[0][:, n - 2], rng)
+        _vary_surface(x[:, THERE + 8 * n:THERE + 8 * n + 8], maps[0][:, _SURFACE_FOUND + n], rng)
     if rng.random() < 0.5:
         x, *maps = (torch.flip(m, [3]) for m in (x, *maps))
         for at in range(0, CHANNELS // 4 * 4, 4):

@@ -4,10 +4,11 @@ Evidence counts frames, pixel by pixel. Where a frame may be believed that contr
 remembered, and where all of them err alike, shows only in how both differ round about: along a
 rim, on a pane, between leaves. A convolutional network (a U-net, Ronneberger et al. 2015), at half
 size and run by OpenCV, sees the newest measurement, what was passed over for it, what was
-remembered, both as one, and the floor and the likeliest wall behind it; it chooses between
-them, and tells percentiles of the error of what it chose, and how probably that is wrong, or only
-sky is there. It only reads: what is remembered goes on as it is (`range_memory`). It was fitted to
-rendered scenes with exact range (`sphstereo_ros.bench.memory_judge`).
+remembered, both as one, the floor and the likeliest wall behind it, and what is seen beside it
+farther away and nearer; it chooses between them, and tells percentiles of the error of what it
+chose, and how probably that is wrong, or only sky is there. It only reads: what is remembered goes
+on as it is (`range_memory`). It was fitted to rendered scenes with exact range
+(`sphstereo_ros.bench.memory_judge`).
 """
 from __future__ import annotations
 
@@ -26,20 +27,23 @@ from .match_judge import likely_error
 from .reliability import LEAST, NEAR_BY, logarithms
 from .warp import Map
 
-_EACH = 25  # inputs of each pixel
+_EACH = 31  # inputs of each pixel
 CHANNELS = 4 * _EACH + 2  # and of each four
 # Inputs: where those of four pixels begin. THERE: whether there is a floor, where, how much a wall
-# carries, and where that is.
-LEVEL, SIGMAS, VIEW, THERE = 0, (4, 32, 48), 20, 84
-_TOLD = 11  # outputs for each pixel
-BLOCK = 8  # px at half size: what the network halves three times
+# carries, and where that is; how close what is farther beside it, where, and how much its grey
+# differs; and these of what is nearer.
+LEVEL, SIGMAS, VIEW, THERE, GREYS = 0, (4, 32, 48), 20, 84, (108, 120)
+PRESENT = (24, 84, 92, 100, 112)  # over 0 where something was remembered, or is floor, wall, …
+_TOLD = 13  # outputs for each pixel
+BLOCK = 16  # px at half size: what the network halves four times
 ROUND = 16  # px at half size that it sees beyond the seam
 _LEAST, _MOST = np.float32(1e-3), np.float32(10)  # shares that sigma counts for
 _APART = np.float32(2)  # logarithm by which inverse ranges differ at most, or share
 _EVIDENCE = np.float32(1 / 6)
 _LOGARITHMS = (*range(8), *range(16, 20), *range(28, 36), *range(44, 52), *range(56, 84),
-               *range(88, 92), *range(96, 100), 101)
-_DIFFERENCES = (*range(28, 32), *range(44, 48), *range(68, 72), *range(88, 92), *range(96, 100))
+               *range(88, 92), *range(96, 100), *range(104, 108), *range(116, 120), 125)
+_DIFFERENCES = (*range(28, 32), *range(44, 48), *range(68, 72), *range(88, 92), *range(96, 100),
+                *range(104, 112), *range(116, 124))
 _TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
 # Probabilities of being off by over a tenth with which it is told, and told to be free.
 _OFF, _OFF_FREE = 0.85, 0.1
@@ -65,6 +69,7 @@ class Opinions:
     fused : inverse range, sigma and evidence of both as one
     floor : inverse range of the floor if nothing hides it, as of `floor_seen`
     wall : inverse range of the likeliest wall, and how much it carries, as of `walls_seen`
+    beside : (6, H, 2H), of `beside`, of both as one
     pose : the pose's share of sigma
     wider : (7, H, 2H), as `Judged.wider`, of what was measured
     """
@@ -75,6 +80,7 @@ class Opinions:
     fused: tuple[Map, Map, Map]
     floor: Map
     wall: tuple[Map, Map]
+    beside: NDArray[np.float32]
     pose: Map
     wider: NDArray[np.float32]
 
@@ -94,8 +100,8 @@ def _differs(rho: np.float32, level: np.float32,
 @fast_kernel
 def _input(view: Image8, measured: tuple[Map, ...], frames: Evidence, before: tuple[Map, ...],
            fused: tuple[Map, ...], floor: Map, wall: tuple[Map, ...],
-           wider: NDArray[np.float32], pixel: np.float32, r: int, c: int, n: int, x: Map,
-           p: int) -> None:  # pragma: no cover - compiled
+           beside: NDArray[np.float32], wider: NDArray[np.float32], pixel: np.float32, r: int,
+           c: int, n: int, x: Map, p: int) -> None:  # pragma: no cover - compiled
     """Column p of `x`, of pixel (r, c), the n-th of its four, before logarithms."""
     one, nothing = np.float32(1), np.float32(NOTHING)
     rho, old, both = measured[0][r, c], before[0][r, c], fused[0][r, c]
@@ -127,12 +133,19 @@ def _input(view: Image8, measured: tuple[Map, ...], frames: Evidence, before: tu
     x[88 + n, p] = _differs(floor[r, c], level, pixel) if seen else one
     x[92 + n, p] = wall[1][r, c]
     x[96 + n, p] = _differs(wall[0][r, c], level, pixel) if wall[0][r, c] > 0 else one
+    for k in range(2):
+        place, close, grey = beside[3 * k, r, c], beside[3 * k + 1, r, c], beside[3 * k + 2, r, c]
+        x[100 + 12 * k + n, p] = close
+        x[104 + 12 * k + n, p] = _differs(place, level, pixel) if close > 0 else one
+        alike = (grey - np.float32(view[r, c])) * np.float32(1 / 64)
+        x[108 + 12 * k + n, p] = alike if close > 0 else np.float32(0)
 
 
 @fast_kernel
 def _input_rows(first: int, last: int, view: Image8, measured: tuple[Map, ...], frames: Evidence,
                 before: tuple[Map, ...], fused: tuple[Map, ...], floor: Map,
-                wall: tuple[Map, ...], wider: NDArray[np.float32], sine: Map, scale: Map,
+                wall: tuple[Map, ...], beside: NDArray[np.float32],
+                wider: NDArray[np.float32], sine: Map, scale: Map,
                 out: NDArray[np.float32]) -> None:  # pragma: no cover - compiled
     """Rows of `out` (1, CHANNELS, …): on round the sphere, at the end as the last."""
     height, width = view.shape
@@ -143,9 +156,9 @@ def _input_rows(first: int, last: int, view: Image8, measured: tuple[Map, ...], 
                 for n in range(4):
                     r = min(2 * i + (n >> 1), height - 1)
                     c = (2 * (start + p - ROUND) + (n & 1)) % width
-                    _input(view, measured, frames, before, fused, floor, wall, wider, scale[0], r,
-                           c, n, x, p)
-                    x[100, p], x[101, p] = sine[r, c], scale[1]
+                    _input(view, measured, frames, before, fused, floor, wall, beside, wider,
+                           scale[0], r, c, n, x, p)
+                    x[124, p], x[125, p] = sine[r, c], scale[1]
             logarithms(x, _LOGARITHMS)
             for k in _DIFFERENCES:
                 for p in range(BLOCK):
@@ -188,7 +201,7 @@ def inputs(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
     scale = np.array([pixel_of(height, longest), shortest / longest], np.float32)
     rows_in_parallel(_input_rows, size[0], view, opinions.measured, opinions.frames,
                      opinions.before, opinions.fused, opinions.floor, opinions.wall,
-                     opinions.wider, _sine(height, direction), scale, out)
+                     opinions.beside, opinions.wider, _sine(height, direction), scale, out)
     return out
 
 
@@ -209,7 +222,7 @@ def _near_by(rho: np.float32, baseline: np.float32) -> bool:  # pragma: no cover
 
 @fast_kernel
 def _chosen(told: NDArray[np.float32], measured: Map, before: tuple[Map, ...],
-            fused: tuple[Map, ...], others: tuple[Map, ...], i: int,
+            fused: tuple[Map, ...], others: tuple[Map, ...], beside: NDArray[np.float32], i: int,
             j: int) -> np.float32:  # pragma: no cover - compiled
     best, most, nothing = measured[i, j], told[3, i, j], np.float32(NOTHING)
     if before[1][i, j] < nothing and told[4, i, j] > most:
@@ -219,6 +232,9 @@ def _chosen(told: NDArray[np.float32], measured: Map, before: tuple[Map, ...],
     for n in range(len(others)):  # a floor or wall where there is one
         if told[6 + n, i, j] > most and (n == 0 or others[n][i, j] > 0):
             best, most = others[n][i, j], told[6 + n, i, j]
+    for n in range(2):
+        if told[9 + n, i, j] > most and beside[3 * n + 1, i, j] > 0:
+            best, most = beside[3 * n, i, j], told[9 + n, i, j]
     return np.float32(best)
 
 
@@ -242,8 +258,8 @@ def _may_hide(best: np.float32, nearer: np.float32, unit: np.float32, measured: 
 @fast_kernel
 def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tuple[Map, ...],
                 frames: Evidence, before: tuple[Map, ...], fused: tuple[Map, ...],
-                others: tuple[Map, ...], pose: Map, scale: Map, bounds: Map, rho: Map,
-                sigma: Map) -> None:  # pragma: no cover - compiled
+                others: tuple[Map, ...], beside: NDArray[np.float32], pose: Map, scale: Map,
+                bounds: Map, rho: Map, sigma: Map) -> None:  # pragma: no cover - compiled
     """others : what was passed over, floor, wall; scale : inverse range of a pixel, shortest
     baseline, share of the 95th percentile, inverse range of what is told to be free; bounds :
     logits of _OFF, _OFF_FREE and _SKY
@@ -251,14 +267,14 @@ def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tupl
     nothing, least, pixel = np.float32(NOTHING), np.float32(LEAST), scale[0]
     for i in range(first, last):
         for j in range(rho.shape[1]):
-            best = _chosen(told, measured[0], before, fused, others, i, j)
+            best = _chosen(told, measured[0], before, fused, others, beside, i, j)
             unit = max(best, pixel)
             nearer = (np.exp(told[2, i, j]) - least) * unit
             hides = _may_hide(best, nearer, unit, measured[0][i, j], frames[i, j],
                               others[1][i, j], scale[1])
             own = likely_error(told, 0, i, j, scale[2]) * unit
             spread = np.sqrt(own * own + pose[i, j] * pose[i, j])
-            off, sky = told[9, i, j], told[10, i, j]
+            off, sky = told[11, i, j], told[12, i, j]
             sure = off <= bounds[0]
             sure &= off <= bounds[1] or not beyond(best, spread, scale[3])
             sure &= sky <= bounds[2] or not _near_by(best, scale[1])
@@ -273,12 +289,12 @@ def _logits(*probabilities: float) -> Map:
 
 
 def told(x: NDArray[np.float32], height: int) -> NDArray[np.float32]:
-    """The network's outputs, float32 (11, H, 2H): logarithms of the 68th and 95th percentile of
+    """The network's outputs, float32 (13, H, 2H): logarithms of the 68th and 95th percentile of
     the error of what is chosen and of the 98th of how much nearer the truth may be, as shares of
-    the inverse range (at least of `pixel_of`), with LEAST added; six by which what was measured,
-    remembered, both as one, what was passed over, the floor, or the wall is chosen; and the logits
-    of the probabilities that it is off by over a tenth of its inverse range, and that only sky is
-    there.
+    the inverse range (at least of `pixel_of`), with LEAST added; eight by which what was measured,
+    remembered, both as one, what was passed over, the floor, the wall, or what is beside it,
+    farther or nearer, is chosen; and the logits of the probabilities that it is off by over a
+    tenth of its inverse range, and that only sky is there.
     """
     whole = of_each_pixel(interior(_network()(x), height), _TOLD)
     return np.ascontiguousarray(whole[:, :height])
@@ -296,6 +312,7 @@ def judged(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
                      np.float32)
     rows_in_parallel(_judge_rows, len(rho), outputs, opinions.measured, opinions.frames,
                      opinions.before, opinions.fused,
-                     (opinions.wider[3], opinions.floor, opinions.wall[0]), opinions.pose, scale,
+                     (opinions.wider[3], opinions.floor, opinions.wall[0]), opinions.beside,
+                     opinions.pose, scale,
                      _logits(_OFF, _OFF_FREE, _SKY), rho, sigma)
     return rho, sigma

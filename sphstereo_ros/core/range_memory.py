@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .beside import beside
 from .floor import Floats, floor_plane, floor_seen
 from .frames import FrameKey, Image8, Reference, RelativePose
 from .history import PoseHistory
@@ -214,9 +215,12 @@ class RangeMemory:
         self._frames += 1
         baselines = [in_steps(r.pose).baseline for r in references]
         if view is not None and new.wider is not None and self._frames > 1:
+            pixel = float(pixel_of(len(view), max(baselines)))
+            likely = np.where(moved.sigma < NOTHING, moved.rho, new.rho)
             opinions = Opinions((new.rho, new.sigma, new.other, new.told), frames, before,
                                 (moved.rho, moved.sigma, moved.evidence),
-                                *self._surfaces(moved, max(baselines)), new.pose, new.wider)
+                                *self._surfaces(moved, pixel),
+                                beside(likely, moved.sigma, view, pixel), new.pose, new.wider)
             return Remembered(*self._judged(view, opinions, references[0].pose.direction,
                                             (min(baselines), max(baselines))), moved.evidence)
         enough = (moved.evidence >= min(self._frames, _PUBLISHED)) & (frames >= 0)
@@ -225,13 +229,12 @@ class RangeMemory:
         return Remembered(moved.rho, np.where(enough, moved.sigma, np.float32(NOTHING)),
                           moved.evidence)
 
-    def _surfaces(self, known: Remembered, longest: float) -> tuple[Map, tuple[Map, Map]]:
-        """The floor, and the walls and how much they carry; longest : baseline, m."""
+    def _surfaces(self, known: Remembered, pixel: float) -> tuple[Map, tuple[Map, Map]]:
+        """The floor, and the walls and how much they carry; pixel : as of `walls_seen`."""
         plane = floor_plane(known.rho, known.sigma, self._down)
         floor = floor_seen(plane, len(known.rho))
         up = self._down if plane is None else plane / np.linalg.norm(plane)
-        return floor, walls_seen(known.rho, known.sigma, floor, up,
-                                 float(pixel_of(len(floor), longest)))
+        return floor, walls_seen(known.rho, known.sigma, floor, up, pixel)
 
     def _judged(self, view: Image8, opinions: Opinions, direction: Floats,
                 baselines: tuple[float, float]) -> tuple[Map, Map]:

@@ -6,6 +6,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from .beside import beside
 from .config import Config
 from .floor import floor_plane, floor_seen, under_floor
 from .frames import (
@@ -82,6 +83,7 @@ class SphericalStereo:
         self._memory = self._new_memory()
         nothing = np.zeros(noise.shape, np.float32)
         under_floor(nothing, nothing, np.zeros(3))  # noise has no floor, and no walls
+        beside(nothing, nothing, noise, 1.0)
         floor = floor_seen(self._down, len(noise))
         walls_seen(nothing + 1, nothing, floor, self._down, 0.0)
 
