@@ -30,7 +30,7 @@ from sphstereo_ros.bench.memory_judge import (
     patch_of,
     patches_of,
 )
-from sphstereo_ros.core.memory_judge import CHANNELS, PRESENT, THERE, pixel_of
+from sphstereo_ros.core.memory_judge import CHANNELS, GREYS, PRESENT, THERE, VIEW, pixel_of
 from sphstereo_ros.scenes.sequence import TruthFrame, render_sequence, save_sequence
 
 
@@ -184,6 +184,22 @@ def test_a_floor_or_wall_may_be_missing_or_not_where_it_seems_to_be(surface):
         assert np.unique(own.round(3)).tolist() == np.unique(where.round(3)).tolist()
         kinds.add('none' if not where.any() else 'as it is' if 0.2 in offs.round(3) else 'off')
     assert kinds == {'none', 'as it is', 'off'}
+
+
+def test_in_another_light_greys_differ_as_the_picture_does():
+    pytest.importorskip('torch')
+    given = samples(np.random.default_rng(0))
+    x = given.x.copy()
+    x[VIEW:VIEW + 4] = np.where(np.arange(64) >= 32, 0.2, -0.2)
+    for at in GREYS:
+        x[at:at + 4] = 0.1
+    rng, contrasts = np.random.default_rng(1), []
+    for _ in range(10):
+        seen = _varied(replace(given, x=x), rng)[0][0].numpy()
+        contrasts.append(np.ptp(seen[VIEW]) / 0.4)
+        for at in GREYS:
+            np.testing.assert_allclose(seen[at:at + 4], 0.1 * contrasts[-1], rtol=1e-2)
+    assert np.ptp(contrasts) > 0.2
 
 
 def test_nothing_is_fitted_to_what_is_not_known():
