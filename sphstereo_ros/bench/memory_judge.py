@@ -78,7 +78,6 @@ _POSES, _POSE = 0.3, 0.05  # share of samples of which poses are unsure, and by 
 # Shares of samples without a floor or walls, and with such that are not where they seem to be, and
 # by how much.
 _NO_SURFACE, _SURFACES, _SURFACE = 0.15, 0.2, 0.2
-
 _SURFACE_FOUND = 3  # of `Patch.found`, the floor, and the wall after it
 
 _NEVER, _UNKNOWN = -1e4, 2.3  # a logit; logarithm of sigma over inverse range

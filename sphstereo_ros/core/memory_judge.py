@@ -69,7 +69,7 @@ class Opinions:
     fused : inverse range, sigma and evidence of both as one
     floor : inverse range of the floor if nothing hides it, as of `floor_seen`
     wall : inverse range of the likeliest wall, and how much it carries, as of `walls_seen`
-    beside : (6, H, 2H), of `beside`, of both as one
+    beside : (6, H, 2H), of `beside`, of both as one, or of what was measured where that is unknown
     pose : the pose's share of sigma
     wider : (7, H, 2H), as `Judged.wider`, of what was measured
     """
