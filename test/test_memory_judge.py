@@ -72,15 +72,15 @@ def view(height: int = HEIGHT) -> np.ndarray:
 
 class Tells:
     """In place of the network: the same everywhere, share of the inverse range that the error is,
-    choices, probability of being off, share by which the truth may be nearer, and probability of
-    sky.
+    choices, and probabilities of being off, of sky, and of hiding something near.
     """
 
     def __init__(self, likely: float, choices: tuple[float, ...], off: float = 0.01,
-                 nearer: float = 0.05, sky: float = 0.01) -> None:
+                 sky: float = 0.01, danger: float = 0.01) -> None:
         choices = (*choices, *[-9.0] * (8 - len(choices)))
-        self.outputs = [*np.log(np.array([likely, likely, nearer]) + LEAST), *choices,
-                        np.log(off / (1 - off)), np.log(sky / (1 - sky))]
+        probable = np.array([off, sky, danger])
+        self.outputs = [*np.log(np.array([likely, likely]) + LEAST), *choices,
+                        *np.log(probable / (1 - probable))]
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         out = np.repeat(np.asarray(self.outputs, np.float32), 4)
@@ -151,45 +151,14 @@ def test_what_may_be_only_sky_is_not_told_near_by(monkeypatch, baselines, sky, k
     assert ((sigma < NOTHING) == known).all()
 
 
-@pytest.mark.parametrize(('distance', 'nearer', 'known'), [
-    (8.0, 0.28, True), (8.0, 0.32, False), (50.0, 0.48, True), (50.0, 0.52, False)])
-def test_the_floor_is_not_told_where_something_may_stand_on_it(monkeypatch, distance, nearer,
-                                                               known):
+@pytest.mark.parametrize('distance', [3.0, 30.0, np.inf])
+@pytest.mark.parametrize('choices', [(1,), (0, 0, 1), (0, 0, 0, 0, 1)])
+@pytest.mark.parametrize(('danger', 'known'), [(0.48, True), (0.52, False)])
+def test_what_may_hide_something_near_is_unknown(monkeypatch, distance, choices, danger, known):
     given = opinions()
-    given.measured[0][:] = given.wider[3] = 0.99 / distance
-    given.floor[:] = 1 / distance
-    _, sigma = told(monkeypatch, Tells(0.1, (0, 0, 0, 0, 1), nearer=nearer), given)
+    given.measured[0][:] = given.fused[0][:] = given.floor[:] = 1 / distance
+    _, sigma = told(monkeypatch, Tells(0.1, choices, danger=danger), given)
     assert ((sigma < NOTHING) == known).all()
-    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), nearer=nearer), given)
-    assert (sigma < NOTHING).all()
-
-
-@pytest.mark.parametrize(('measured', 'choices', 'known'), [
-    (0.95 * FLOOR / 1.3, (0, 0, 0, 0, 1), False), (1.05 * FLOOR / 1.3, (0, 0, 0, 0, 1), True),
-    (0.95 * FLOOR / 1.3, (1, 0, 0), True)])
-def test_the_floor_is_not_told_where_something_is_seen_beneath(monkeypatch, measured, choices,
-                                                               known):
-    """A mirror, or what moves along and has no parallax."""
-    given = opinions()
-    given.measured[0][:] = measured
-    _, sigma = told(monkeypatch, Tells(0.1, choices), given)
-    assert ((sigma < NOTHING) == known).all()
-
-
-@pytest.mark.parametrize('near', [True, False])
-def test_where_something_may_be_much_nearer_nothing_is_told_near_by(monkeypatch, near):
-    given = opinions()
-    share = 1.4 if near else 0.3
-    given.measured[0][:] = share / (NEAR_BY * BASELINES[0]) / 1.9
-    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), nearer=0.9), given)
-    assert ((sigma == NOTHING) == near).all()
-
-
-def test_where_the_newest_frame_may_hide_something_near_nothing_is_told(monkeypatch):
-    given = opinions()
-    given.frames[4, 7] = -1
-    _, sigma = told(monkeypatch, Tells(0.1, (0, 0, 1)), given)
-    assert np.argwhere(sigma == NOTHING).tolist() == [[4, 7]]
 
 
 @pytest.mark.parametrize('farthest', [20, 50, 120, 500])
@@ -211,38 +180,45 @@ def test_where_nothing_is_told_to_be_free_it_need_not_be_surer(monkeypatch):
     assert (sigma < NOTHING).all()
 
 
-@pytest.mark.parametrize(('ratio', 'frames', 'known'), [
-    (1.4, 1, False), (1.2, 1, True), (1.4, 0, True)])
-def test_nothing_is_told_behind_what_the_newest_frame_sees_near_by(monkeypatch, ratio, frames,
-                                                                   known):
-    given = opinions()
-    given.measured[0][:] = 1.1 / (NEAR_BY * BASELINES[0])
-    given.before[0][:] = given.measured[0] / ratio
-    given.frames[:] = frames
-    _, sigma = told(monkeypatch, Tells(0.1, (0, 1, 0)), given)
-    assert ((sigma < NOTHING) == known).all()
-
-
-@pytest.mark.parametrize('baselines', [10, 60, 200])
-@pytest.mark.parametrize(('off', 'known'), [(0.84, True), (0.86, False)])
-def test_what_is_probably_off_is_unknown_at_any_range(monkeypatch, baselines, off, known):
-    given = opinions()
-    given.measured[0][:] = 1 / (baselines * BASELINES[0])
-    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), off=off), given)
-    assert ((sigma < NOTHING) == known).all()
-
-
-@pytest.mark.parametrize(('distance', 'nearer', 'sky', 'known'), [
-    (16.5, 0.75, 0.01, False), (18.0, 0.75, 0.01, True), (5.0, 0.65, 0.01, True),
-    (9.9, 0.05, 0.06, False), (10.1, 0.05, 0.06, True)])
-def test_ten_metres_are_near_however_slowly_the_camera_moves(monkeypatch, distance, nearer, sky,
-                                                             known):
+@pytest.mark.parametrize(('ratio', 'frames', 'distance', 'disputed'), [
+    (1.4, 1, 9.0, True), (1.2, 1, 9.0, False), (1.4, 0, 9.0, False), (1.4, 1, 13.0, False),
+    (0.8, -1, 9.0, True), (0.8, -1, 50.0, True)])
+@pytest.mark.parametrize('danger', [0.08, 0.12, 0.48])
+def test_what_the_newest_frame_disputes_has_to_be_surer(monkeypatch, ratio, frames, distance,
+                                                        disputed, danger):
+    """Whether it may miss something near, or sees it before what is told."""
     given = opinions()
     given.measured[0][:] = 1 / distance
-    monkeypatch.setattr(memory_judge, '_network',
-                        lambda: Tells(0.1, (1, 0, 0), nearer=nearer, sky=sky))
+    given.before[0][:] = given.measured[0] / ratio
+    given.frames[:] = frames
+    _, sigma = told(monkeypatch, Tells(0.1, (0, 1, 0), danger=danger), given)
+    assert ((sigma < NOTHING) == (not disputed or danger < 0.1)).all()
+
+
+@pytest.mark.parametrize(('baselines', 'most'), [(10, 0.85), (119, 0.85), (121, 0.75), (300, 0.75)])
+@pytest.mark.parametrize('over', [True, False])
+def test_what_is_probably_off_is_unknown(monkeypatch, baselines, most, over):
+    given = opinions()
+    given.measured[0][:] = 1 / (baselines * BASELINES[0])
+    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), off=most + (0.01 if over else -0.01)), given)
+    assert ((sigma == NOTHING) == over).all()
+
+
+@pytest.mark.parametrize(('distance', 'known'), [(9.9, False), (10.1, True)])
+def test_ten_metres_are_near_however_slowly_the_camera_moves(monkeypatch, distance, known):
+    given = opinions()
+    given.measured[0][:] = 1 / distance
+    monkeypatch.setattr(memory_judge, '_network', lambda: Tells(0.1, (1, 0, 0), sky=0.06))
     _, sigma = judged(view(), given, AHEAD, (0.03, 30.0))
     assert ((sigma < NOTHING) == known).all()
+
+
+@pytest.mark.parametrize(('shortest', 'wanted'), [(0.03, 10.0), (1.0, NEAR_BY)])
+def test_the_network_sees_how_far_is_near_by(shortest, wanted):
+    """As the logarithm of its parallax, px of the longest baseline."""
+    x = interior(inputs(view(), opinions(), AHEAD, (shortest, 2.0)), HEIGHT)[0]
+    parallax = HEIGHT * 2.0 / (np.pi * wanted)
+    np.testing.assert_allclose(x[-1], np.log(parallax), atol=1e-3)
 
 
 def test_what_the_network_sees():
@@ -265,13 +241,13 @@ def test_what_the_network_sees():
               CARRIES, np.log((WALL + PIXEL) / (0.2 + PIXEL)),
               CLOSE[0], np.log((FARTHER + PIXEL) / (0.2 + PIXEL)), (224 - 192) / 64,
               CLOSE[1], np.log((NEARER + PIXEL) / (0.2 + PIXEL)), (128 - 192) / 64]
-    np.testing.assert_allclose(inside[(slice(n, -2, 4), *at)], wanted, atol=1e-3)
+    np.testing.assert_allclose(inside[(slice(n, -3, 4), *at)], wanted, atol=1e-3)
     elsewhere = inside[0, 3, 4]
     assert elsewhere == pytest.approx(np.log(1 + 0.1 / PIXEL), abs=1e-3)
-    assert inside[-1].mean() == pytest.approx(np.log(0.1), abs=1e-3)
+    assert inside[-2].mean() == pytest.approx(np.log(0.1), abs=1e-3)
     longitude = (np.arange(HEIGHT) + 0.75) / HEIGHT * 2 * np.pi - np.pi
     along = np.cos(longitude) * np.cos(1.5 / HEIGHT * np.pi)
-    np.testing.assert_allclose(inside[-2, HEIGHT // 4], np.sqrt(1 - along**2), atol=1e-3)
+    np.testing.assert_allclose(inside[-3, HEIGHT // 4], np.sqrt(1 - along**2), atol=1e-3)
 
 
 def test_nothing_remembered_looks_like_nothing():
@@ -286,19 +262,19 @@ def test_no_floor_no_wall_and_nothing_beside_look_like_none():
     given = opinions()
     given.floor[:], given.wall[0][:], given.wall[1][:], given.beside[:] = 0, 0, 0, 0
     x = interior(inputs(view(), given, AHEAD, BASELINES), HEIGHT)[0]
-    np.testing.assert_allclose(x[THERE:-2], 0, atol=1e-3)
+    np.testing.assert_allclose(x[THERE:-3], 0, atol=1e-3)
 
 
 def test_it_goes_on_round_the_sphere():
     given = opinions()
     given.measured[0][:, :2] = 0.3
     x = inputs(view(), given, AHEAD, BASELINES)
-    np.testing.assert_array_equal(x[0, :-2, :, ROUND], x[0, :-2, :, ROUND + HEIGHT])
+    np.testing.assert_array_equal(x[0, :-3, :, ROUND], x[0, :-3, :, ROUND + HEIGHT])
     turned = opinions()
     turned.measured[0][:, 20:22] = 0.3
     turned = inputs(view(), turned, AHEAD, BASELINES)
-    np.testing.assert_array_equal(interior(turned, HEIGHT)[0, :-2, :, 10],
-                                  interior(x, HEIGHT)[0, :-2, :, 0])
+    np.testing.assert_array_equal(interior(turned, HEIGHT)[0, :-3, :, 10],
+                                  interior(x, HEIGHT)[0, :-3, :, 0])
 
 
 @settings(deadline=None, max_examples=25)

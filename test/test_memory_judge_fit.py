@@ -101,7 +101,7 @@ def test_a_fit_chooses_and_tells_the_error():
     with torch.no_grad():
         x = torch.from_numpy(given.x.astype(np.float32))[None]
         out = torch.nn.functional.pixel_shuffle(DESIGN.forward(parts, x), 2)[0].numpy()
-    choice = out[3:11].argmax(0)
+    choice = out[2:10].argmax(0)
     inside = np.s_[8:-8, 8:56], np.s_[8:-8, 72:120]
     assert (choice[inside[0]] == 0).mean() > 0.9
     assert (choice[inside[1]] == 1).mean() > 0.9
@@ -118,8 +118,8 @@ def test_a_choice_that_is_too_far_costs_most():
 
     def costs(true: float) -> float:
         out = torch.zeros(1, len(DESIGN.begin), 64, 64)
-        out[:, :12] = np.log(0.01)
-        out[:, 12:16] = 20.0  # what was measured
+        out[:, :8] = np.log(0.01)
+        out[:, 8:12] = 20.0  # what was measured
         return float(loss(out, x, found, true * one, one))
     assert costs(0.0) < costs(-0.4) < costs(0.4) - 1.0
 
@@ -137,8 +137,8 @@ def test_what_is_not_there_is_no_choice(choice, at):
         if not there:
             x[:, at:at + 4] = 2.303 if choice == 2 else 0.0
         out = torch.zeros(1, len(DESIGN.begin), 64, 64)
-        out[:, :12], out[:, 12:16] = np.log(0.01), 1.0
-        out[:, 12 + 4 * choice:16 + 4 * choice] = logit
+        out[:, :8], out[:, 8:12] = np.log(0.01), 1.0
+        out[:, 8 + 4 * choice:12 + 4 * choice] = logit
         return float(loss(out, x, found, 0.0 * one, one))
     assert costs(9.0, there=True) > costs(-9.0, there=True) + 0.5
     assert costs(9.0, there=False) == pytest.approx(costs(-9.0, there=False), abs=1e-5)
@@ -155,11 +155,34 @@ def test_it_costs_to_take_sky_for_something_or_something_for_sky(sky):
 
     def costs(logit: float) -> float:
         out = torch.zeros(1, len(DESIGN.begin), 64, 64)
-        out[:, :12] = np.log(0.01)
-        out[:, 48:] = logit
+        out[:, :8] = np.log(0.01)
+        out[:, 44:48] = logit
         return float(loss(out, x, found, (-level if sky else -0.2) * one, one))
     assert (costs(3.0) < costs(-3.0) - 2.0) == sky
     assert (costs(-3.0) < costs(3.0) - 2.0) == (not sky)
+
+
+@pytest.mark.parametrize(('nearer', 'from_near', 'danger'), [
+    (0.5, 0.1, True), (0.5, -0.1, False), (0.3, 0.1, False), (-0.5, 0.1, False)])
+def test_danger_is_what_is_near_by_and_told_much_farther(nearer, from_near, danger):
+    """nearer, from_near : logarithms, of what was measured, and of how far is near by."""
+    torch = pytest.importorskip('torch')
+    given = samples(np.random.default_rng(0))
+    x = torch.from_numpy(given.x.astype(np.float32))[None]
+    level = 3.0
+    x[:, -1] = np.log(np.exp(level + nearer) - 1) - from_near
+    found = torch.from_numpy(given.found.astype(np.float32))[None]
+    one = torch.ones(1, 1, 128, 128)
+
+    def costs(logit: float) -> float:
+        out = torch.zeros(1, len(DESIGN.begin), 64, 64)
+        out[:, :8], out[:, 8:12] = np.log(0.01), 20.0
+        out[:, 48:] = logit
+        return float(loss(out, x, found, nearer * one, one))
+    assert (costs(3.0) < costs(-3.0) - 2.0) == danger
+    assert (costs(-3.0) < costs(3.0) - 2.0) == (not danger)
+    if danger:
+        assert costs(-3.0) - costs(3.0) == pytest.approx(30, rel=0.1)
 
 
 @pytest.mark.parametrize('surface', [0, 1])
@@ -200,6 +223,16 @@ def test_in_another_light_greys_differ_as_the_picture_does():
         for at in GREYS:
             np.testing.assert_allclose(seen[at:at + 4], 0.1 * contrasts[-1], rtol=1e-2)
     assert np.ptp(contrasts) > 0.2
+
+
+def test_how_far_is_near_by_varies():
+    pytest.importorskip('torch')
+    given, rng = samples(np.random.default_rng(0)), np.random.default_rng(1)
+    drawn = np.stack([_varied(given, rng)[0][0, -1].numpy() for _ in range(20)])
+    offs = drawn.mean((1, 2)) - given.x[-1].mean()
+    assert np.abs(offs).max() < 0.75
+    assert np.ptp(offs) > 1
+    assert drawn.std((1, 2)).max() < 0.2
 
 
 def test_nothing_is_fitted_to_what_is_not_known():

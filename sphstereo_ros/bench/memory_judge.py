@@ -82,11 +82,14 @@ _SURFACE_FOUND = 3  # of `Patch.found`, the floor, and the wall after it
 
 _NEVER, _UNKNOWN = -1e4, 2.3  # a logit; logarithm of sigma over inverse range
 _OFF, _RARELY = 0.1, -2.0  # share of the inverse range by which it is off, and a logit to begin
+# Times as far as the truth, near by, that is dangerous, how many times that counts, and by how
+# much the logarithm of how far is near by varies.
+_FREE, _DANGER, _NEAR_BY = 1.5, 10.0, 0.7
 _SKY = 0.05  # px of parallax of the longest baseline: with less nothing is there
 
-_OF_ERROR, _CHOSEN = len(PERCENTILES), 8
+_OF_ERROR, _CHOSEN = 2, 8
 DESIGN = Design(CHANNELS, _WIDTHS, _LAST,
-                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * (4 * _CHOSEN) + [_RARELY] * 8,
+                [_BEGIN] * (4 * _OF_ERROR) + [0.0] * (4 * _CHOSEN) + [_RARELY] * 12,
                 deep=True)
 
 
@@ -210,10 +213,13 @@ def loss(out: Any, x: Any, found: Any, true: Any, weight: Any) -> Any:
     likeliest = torch.exp(level + each.gather(1, choices.argmax(1, keepdim=True))) - 1
     pixels = torch.exp(level + true) - 1
     off = (pixels - likeliest) / likeliest.clamp(min=1)
+    danger = (pixels > torch.exp(x[:, -1:, :1, :1])) & (pixels > _FREE * likeliest)
     doubted = functional.binary_cross_entropy_with_logits(
-        doubt, torch.cat([off.abs() > _OFF, pixels < _SKY], 1).float(),
+        doubt, torch.cat([off.abs() > _OFF, pixels < _SKY, danger], 1).float(),
+        torch.cat([torch.ones_like(doubt[:, :2]), 1 + (_DANGER - 1) * danger.float()], 1),
         reduction='none').sum(1, keepdim=True)
-    return (percentile_loss(told[:, :_OF_ERROR], off, weight, LEAST, MOST, PERCENTILES)
+    return (percentile_loss(told[:, :_OF_ERROR], off.abs(), weight, LEAST, MOST,
+                            PERCENTILES[:_OF_ERROR])
             + (weight * (chosen.sum(1, keepdim=True) + doubted)).sum() / weight.sum())
 
 
@@ -239,6 +245,7 @@ def _varied(patch: Patch, rng: np.random.Generator) -> tuple[Any, ...]:
         share = _POSE * float(rng.random())
         for at in SIGMAS:
             x[:, at:at + 4] = 0.5 * torch.log(torch.exp(2 * x[:, at:at + 4]) + share**2)
+    x[:, -1] += _NEAR_BY * float(rng.uniform(-1, 1))
     for n in range(2):
         _vary_surface(x[:, THERE + 8 * n:THERE + 8 * n + 8], maps[0][:, _SURFACE_FOUND + n], rng)
     if rng.random() < 0.5:

@@ -237,7 +237,7 @@ class RangeConfig:
     minimum: float = _p('range.min', 0.3, 'nearer is −Inf', unit='m', low=0.0, high=1000.0)
     maximum: float = _p('range.max', 120.0, 'confidently farther is +Inf', unit='m', low=0.1,
                         high=10000.0)
-    max_relative_sigma: float = _p('range.max_relative_sigma', 0.5, 'sigma over range above '
+    max_relative_sigma: float = _p('range.max_relative_sigma', 0.7, 'sigma over range above '
                                    'which the range is unknown', low=0.001, high=10.0)
 
 

@@ -6,9 +6,9 @@ rim, on a pane, between leaves. A convolutional network (a U-net, Ronneberger et
 size and run by OpenCV, sees the newest measurement, what was passed over for it, what was
 remembered, both as one, the floor and the likeliest wall behind it, and what is seen beside it
 farther away and nearer; it chooses between them, and tells percentiles of the error of what it
-chose, and how probably that is wrong, or only sky is there. It only reads: what is remembered goes
-on as it is (`range_memory`). It was fitted to rendered scenes with exact range
-(`sphstereo_ros.bench.memory_judge`).
+chose, and how probably that is wrong, hides something near, or only sky is there. It only reads:
+what is remembered goes on as it is (`range_memory`). It was fitted to rendered scenes with exact
+range (`sphstereo_ros.bench.memory_judge`).
 """
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from .inverse_range import NOTHING, _grid_angles, beyond
 from .jit import fast_kernel, rows_in_parallel
 from .judgement import Evidence
 from .match_judge import likely_error
-from .reliability import LEAST, NEAR_BY, logarithms
+from .reliability import NEAR_BY, logarithms
 from .warp import Map
 
 _EACH = 31  # inputs of each pixel
-CHANNELS = 4 * _EACH + 2  # and of each four
+CHANNELS = 4 * _EACH + 3  # and of each four
 # Inputs: where those of four pixels begin. THERE: whether there is a floor, where, how much a wall
 # carries, and where that is; how close what is farther beside it, where, and how much its grey
 # differs; and these of what is nearer.
@@ -41,20 +41,23 @@ _LEAST, _MOST = np.float32(1e-3), np.float32(10)  # shares that sigma counts for
 _APART = np.float32(2)  # logarithm by which inverse ranges differ at most, or share
 _EVIDENCE = np.float32(1 / 6)
 _LOGARITHMS = (*range(8), *range(16, 20), *range(28, 36), *range(44, 52), *range(56, 84),
-               *range(88, 92), *range(96, 100), *range(104, 108), *range(116, 120), 125)
+               *range(88, 92), *range(96, 100), *range(104, 108), *range(116, 120), 125, 126)
 _DIFFERENCES = (*range(28, 32), *range(44, 48), *range(68, 72), *range(88, 92), *range(96, 100),
                 *range(104, 112), *range(116, 124))
 _TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
-# Probabilities of being off by over a tenth with which it is told, and told to be free.
-_OFF, _OFF_FREE = 0.85, 0.1
+# Probabilities of being off by over a tenth with which it is told, told over _FAR times as far
+# away as what is near by, and told to be free.
+_OFF, _OFF_FAR, _OFF_FREE = 0.85, 0.75, 0.1
+_FAR = 3.0
 _SKY = 0.05  # probability that only sky is there with which nothing is told near by
-# Shares by which something may be nearer with which nothing is told near by; and with which the
-# floor is not, near by and anywhere: what is thin before it, or moves, is easily taken for it.
-_NEARER, _NEARER_FLOOR, _NEARER_FAR_FLOOR = 0.7, 0.3, 0.5
-# Times as far as the floor that the newest frame sees what a mirror shows, or moves along.
-_BENEATH = 1.3
+# Outputs: where the choices begin, and after them the logits of being off, of sky, and of hiding
+# something near.
+_CHOICES, _AFTER = 2, 10
+# Probabilities of hiding something near (counted ten times) with which it is told; and where the
+# newest frame may miss something near, or is believed to see it _BEFORE times nearer.
+_DANGER, _DISPUTED = 0.5, 0.1
+_BEFORE = 1.3
 _NEAR_M = 10.0  # m: what is nearer is near by, however slowly the camera moves
-_BEFORE = 1.3  # times as far away as what the newest frame is believed to see near by
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class Opinions:
 
     measured : inverse range, sigma, second opinion, and sigma by what the grey tells alone, of the
     newest frame; frames : for how many frames of evidence it counts, −1 = something may be much
-    nearer, and nothing is told
+    nearer
     before : inverse range, sigma (NOTHING where unknown) and evidence of what was remembered, and
     how much its errors are like those of the newest frame
     fused : inverse range, sigma and evidence of both as one
@@ -158,7 +161,7 @@ def _input_rows(first: int, last: int, view: Image8, measured: tuple[Map, ...], 
                     c = (2 * (start + p - ROUND) + (n & 1)) % width
                     _input(view, measured, frames, before, fused, floor, wall, beside, wider,
                            scale[0], r, c, n, x, p)
-                    x[124, p], x[125, p] = sine[r, c], scale[1]
+                    x[124, p], x[125, p], x[126, p] = sine[r, c], scale[1], scale[2]
             logarithms(x, _LOGARITHMS)
             for k in _DIFFERENCES:
                 for p in range(BLOCK):
@@ -198,7 +201,8 @@ def inputs(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
     size = [-(-n // BLOCK) * BLOCK for n in (rows, columns + 2 * ROUND)]
     out = np.empty((1, CHANNELS, *size), np.float32)
     shortest, longest = baselines
-    scale = np.array([pixel_of(height, longest), shortest / longest], np.float32)
+    pixel = pixel_of(height, longest)
+    scale = np.array([pixel, shortest / longest, 1 / (near_by(shortest) * pixel)], np.float32)
     rows_in_parallel(_input_rows, size[0], view, opinions.measured, opinions.frames,
                      opinions.before, opinions.fused, opinions.floor, opinions.wall,
                      opinions.beside, opinions.wider, _sine(height, direction), scale, out)
@@ -210,76 +214,64 @@ def interior(maps: NDArray[np.float32], height: int) -> NDArray[np.float32]:
     return maps[:, :, :-(-height // 2), ROUND:ROUND + height]
 
 
+def near_by(shortest: float) -> float:
+    """Range, m, up to which what is told too far is dangerous, of the shortest baseline, m."""
+    return max(shortest * NEAR_BY, _NEAR_M)
+
+
 @cache
 def _network() -> Convolutions:
     return Convolutions('memory_judge.onnx')
 
 
 @fast_kernel
-def _near_by(rho: np.float32, baseline: np.float32) -> bool:  # pragma: no cover - compiled
-    return bool(rho * max(baseline * np.float32(NEAR_BY), np.float32(_NEAR_M)) > 1)
-
-
-@fast_kernel
 def _chosen(told: NDArray[np.float32], measured: Map, before: tuple[Map, ...],
             fused: tuple[Map, ...], others: tuple[Map, ...], beside: NDArray[np.float32], i: int,
             j: int) -> np.float32:  # pragma: no cover - compiled
-    best, most, nothing = measured[i, j], told[3, i, j], np.float32(NOTHING)
-    if before[1][i, j] < nothing and told[4, i, j] > most:
-        best, most = before[0][i, j], told[4, i, j]
-    if fused[1][i, j] < nothing and told[5, i, j] > most:
-        best, most = fused[0][i, j], told[5, i, j]
+    best, most, nothing = measured[i, j], told[_CHOICES, i, j], np.float32(NOTHING)
+    for n, (kept, spread) in enumerate(((before[0], before[1]), (fused[0], fused[1]))):
+        if told[_CHOICES + 1 + n, i, j] > most and spread[i, j] < nothing:
+            best, most = kept[i, j], told[_CHOICES + 1 + n, i, j]
     for n in range(len(others)):  # a floor or wall where there is one
-        if told[6 + n, i, j] > most and (n == 0 or others[n][i, j] > 0):
-            best, most = others[n][i, j], told[6 + n, i, j]
+        if told[_CHOICES + 3 + n, i, j] > most and (n == 0 or others[n][i, j] > 0):
+            best, most = others[n][i, j], told[_CHOICES + 3 + n, i, j]
     for n in range(2):
-        if told[9 + n, i, j] > most and beside[3 * n + 1, i, j] > 0:
-            best, most = beside[3 * n, i, j], told[9 + n, i, j]
+        if told[_CHOICES + 6 + n, i, j] > most and beside[3 * n + 1, i, j] > 0:
+            best, most = beside[3 * n, i, j], told[_CHOICES + 6 + n, i, j]
     return np.float32(best)
 
 
 @fast_kernel
-def _may_hide(best: np.float32, nearer: np.float32, unit: np.float32, measured: np.float32,
-              frames: np.int8, floor: np.float32,
-              baseline: np.float32) -> bool:  # pragma: no cover - compiled
-    """Whether what would be told may hide something near.
-
-    nearer : inverse range by which the truth may be nearer; frames : of what was measured
-    """
-    on_floor = best > 0 and best == floor
-    hides = frames < 0 or (on_floor and measured * np.float32(_BENEATH) < best)
-    hides |= on_floor and nearer > np.float32(_NEARER_FAR_FLOOR) * unit
-    hides |= _near_by(best + nearer, baseline) and (
-        nearer > np.float32(_NEARER_FLOOR if on_floor else _NEARER) * unit)
-    before = frames > 0 and _near_by(measured, baseline)
-    return bool(hides or (before and measured > np.float32(_BEFORE) * best))
+def _disputed(best: np.float32, measured: np.float32, frames: np.int8,
+              near: np.float32) -> bool:  # pragma: no cover - compiled
+    """Whether the newest frame may hide something near, or sees it nearer."""
+    seen = frames > 0 and measured > near
+    return bool(frames < 0 or (seen and measured > np.float32(_BEFORE) * best))
 
 
 @fast_kernel
-def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: tuple[Map, ...],
+def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: Map,
                 frames: Evidence, before: tuple[Map, ...], fused: tuple[Map, ...],
                 others: tuple[Map, ...], beside: NDArray[np.float32], pose: Map, scale: Map,
                 bounds: Map, rho: Map, sigma: Map) -> None:  # pragma: no cover - compiled
-    """others : what was passed over, floor, wall; scale : inverse range of a pixel, shortest
-    baseline, share of the 95th percentile, inverse range of what is told to be free; bounds :
-    logits of _OFF, _OFF_FREE and _SKY
+    """others : what was passed over, floor, wall; scale : inverse range of a pixel and of what is
+    near by, share of the 95th percentile, inverse range of what is told to be free; bounds :
+    logits of _OFF, _OFF_FAR, _OFF_FREE, _SKY, _DANGER and _DISPUTED
     """
-    nothing, least, pixel = np.float32(NOTHING), np.float32(LEAST), scale[0]
+    nothing, pixel, near = np.float32(NOTHING), scale[0], scale[1]
     for i in range(first, last):
         for j in range(rho.shape[1]):
-            best = _chosen(told, measured[0], before, fused, others, beside, i, j)
-            unit = max(best, pixel)
-            nearer = (np.exp(told[2, i, j]) - least) * unit
-            hides = _may_hide(best, nearer, unit, measured[0][i, j], frames[i, j],
-                              others[1][i, j], scale[1])
-            own = likely_error(told, 0, i, j, scale[2]) * unit
+            best = _chosen(told, measured, before, fused, others, beside, i, j)
+            own = likely_error(told, 0, i, j, scale[2]) * max(best, pixel)
             spread = np.sqrt(own * own + pose[i, j] * pose[i, j])
-            off, sky = told[11, i, j], told[12, i, j]
-            sure = off <= bounds[0]
-            sure &= off <= bounds[1] or not beyond(best, spread, scale[3])
-            sure &= sky <= bounds[2] or not _near_by(best, scale[1])
+            off, sky, danger = told[_AFTER, i, j], told[_AFTER + 1, i, j], told[_AFTER + 2, i, j]
+            sure = off <= bounds[0 if best * np.float32(_FAR) > near else 1]
+            sure &= off <= bounds[2] or not beyond(best, spread, scale[3])
+            sure &= sky <= bounds[3] or best < near
+            disputed = _disputed(best, measured[i, j], frames[i, j], near)
+            sure &= danger <= bounds[5 if disputed else 4]
             rho[i, j], sigma[i, j] = best, nothing
-            if sure and not hides:
+            if sure:
                 sigma[i, j] = spread
 
 
@@ -290,11 +282,11 @@ def _logits(*probabilities: float) -> Map:
 
 def told(x: NDArray[np.float32], height: int) -> NDArray[np.float32]:
     """The network's outputs, float32 (13, H, 2H): logarithms of the 68th and 95th percentile of
-    the error of what is chosen and of the 98th of how much nearer the truth may be, as shares of
-    the inverse range (at least of `pixel_of`), with LEAST added; eight by which what was measured,
-    remembered, both as one, what was passed over, the floor, the wall, or what is beside it,
-    farther or nearer, is chosen; and the logits of the probabilities that it is off by over a
-    tenth of its inverse range, and that only sky is there.
+    the error of what is chosen, as shares of the inverse range (at least of `pixel_of`), with
+    LEAST added; eight by which what was measured, remembered, both as one, what was passed over,
+    the floor, the wall, or what is beside it, farther or nearer, is chosen; and the logits of the
+    probabilities that it is off by over a tenth of its inverse range, that only sky is there, and
+    (counted ten times) that it hides something near by, over 1.5 times too far.
     """
     whole = of_each_pixel(interior(_network()(x), height), _TOLD)
     return np.ascontiguousarray(whole[:, :height])
@@ -308,11 +300,11 @@ def judged(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
     """
     outputs = told(inputs(view, opinions, direction, baselines), len(view))
     rho, sigma = np.empty((2, *view.shape), np.float32)
-    scale = np.array([pixel_of(len(view), baselines[1]), baselines[0], np.exp(-_TAIL), farthest],
-                     np.float32)
-    rows_in_parallel(_judge_rows, len(rho), outputs, opinions.measured, opinions.frames,
-                     opinions.before, opinions.fused,
+    scale = np.array([pixel_of(len(view), baselines[1]), 1 / near_by(baselines[0]),
+                      np.exp(-_TAIL), farthest], np.float32)
+    rows_in_parallel(_judge_rows, len(rho), outputs, opinions.measured[0],
+                     opinions.frames, opinions.before, opinions.fused,
                      (opinions.wider[3], opinions.floor, opinions.wall[0]), opinions.beside,
                      opinions.pose, scale,
-                     _logits(_OFF, _OFF_FREE, _SKY), rho, sigma)
+                     _logits(_OFF, _OFF_FAR, _OFF_FREE, _SKY, _DANGER, _DISPUTED), rho, sigma)
     return rho, sigma
