@@ -176,7 +176,7 @@ def test_what_would_be_told_to_be_free_has_to_be_sure(monkeypatch, farthest, tim
 def test_where_nothing_is_told_to_be_free_it_need_not_be_surer(monkeypatch):
     given = opinions()
     given.measured[0][:] = 1e-3
-    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), off=0.8), given)
+    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), off=0.7), given)
     assert (sigma < NOTHING).all()
 
 
@@ -195,12 +195,14 @@ def test_what_the_newest_frame_disputes_has_to_be_surer(monkeypatch, ratio, fram
     assert ((sigma < NOTHING) == (not disputed or danger < 0.1)).all()
 
 
-@pytest.mark.parametrize(('baselines', 'most'), [(10, 0.85), (119, 0.85), (121, 0.75), (300, 0.75)])
+@pytest.mark.parametrize(('baselines', 'most'), [
+    (10, 0.85), (119, 0.85), (121, 0.75), (300, 0.75)])
 @pytest.mark.parametrize('over', [True, False])
 def test_what_is_probably_off_is_unknown(monkeypatch, baselines, most, over):
     given = opinions()
     given.measured[0][:] = 1 / (baselines * BASELINES[0])
-    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), off=most + (0.01 if over else -0.01)), given)
+    off = most + (0.01 if over else -0.01)
+    _, sigma = told(monkeypatch, Tells(0.1, (1, 0, 0), off=off), given)
     assert ((sigma == NOTHING) == over).all()
 
 

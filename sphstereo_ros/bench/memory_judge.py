@@ -53,13 +53,15 @@ _JOBS = (('street', 12, None), ('street', 13, None), ('takeoff', 14, None),
          ('street', 19, None), ('street', 22, None), ('street', 24, 'low_light'),
          ('takeoff', 26, None),
          *(('street', seed, None) for seed in (401, 403, 404, 406, 407, 409, 410, 412, 413, 416,
-                                               431, 433, 434, 441, 442, 444)),
-         *(('street', seed, 'traffic') for seed in (405, 408, 432, 443)), ('takeoff', 411, None),
+                                               431, 433, 434, 441, 442, 444, 450, 451, 453, 454,
+                                               455, 456, 458, 459, 461, 462, 463, 464, 467)),
+         *(('street', seed, 'traffic') for seed in (405, 408, 432, 443, 452, 457, 460, 465)),
+         ('takeoff', 411, None), ('takeoff', 466, None),
          ('street', 417, 'occlusion'), ('street', 421, 'wall'))
 _HEIGHT = 960
 # Frames back of the references, the first frame that is measured, those that are kept, and whether
 # at half the size.
-_WINDOWS = (((1, 4, 7, 10), 4, (10, 12, 13), False), ((1,), 3, (6,), False),
+_WINDOWS = (((1, 4, 7, 10), 4, (7, 10, 12, 13), False), ((1,), 3, (6,), False),
             ((1, 4, 7, 10), 6, (11, 13), True))
 # Weights of what is 10 to 100 m away, of what of it is over 30 m away, and of what is near but was
 # found far.
