@@ -53,9 +53,9 @@ _SKY = 0.05  # probability that only sky is there with which nothing is told nea
 # Outputs: where the choices begin, and after them the logits of being off, of sky, and of hiding
 # something near.
 _CHOICES, _AFTER = 2, 10
-# Probabilities of hiding something near (counted ten times) with which it is told; and where the
-# newest frame may miss something near, or is believed to see it _BEFORE times nearer.
-_DANGER, _DISPUTED = 0.5, 0.1
+# Probabilities of hiding something near (counted ten times) with which it is told; and where it is
+# only the floor, or the newest frame may miss something near, or sees it _BEFORE times nearer.
+_DANGER, _DISPUTED = 0.5, 0.12
 _BEFORE = 1.3
 _NEAR_M = 10.0  # m: what is nearer is near by, however slowly the camera moves
 
@@ -242,11 +242,12 @@ def _chosen(told: NDArray[np.float32], measured: Map, before: tuple[Map, ...],
 
 
 @fast_kernel
-def _disputed(best: np.float32, measured: np.float32, frames: np.int8,
+def _disputed(best: np.float32, measured: np.float32, frames: np.int8, floor: np.float32,
               near: np.float32) -> bool:  # pragma: no cover - compiled
-    """Whether the newest frame may hide something near, or sees it nearer."""
+    """Whether it is only the floor, or the newest frame may miss something near, or sees it."""
     seen = frames > 0 and measured > near
-    return bool(frames < 0 or (seen and measured > np.float32(_BEFORE) * best))
+    on_floor = best > 0 and best == floor
+    return bool(on_floor or frames < 0 or (seen and measured > np.float32(_BEFORE) * best))
 
 
 @fast_kernel
@@ -268,7 +269,7 @@ def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: Map,
             sure = off <= bounds[0 if best * np.float32(_FAR) > near else 1]
             sure &= off <= bounds[2] or not beyond(best, spread, scale[3])
             sure &= sky <= bounds[3] or best < near
-            disputed = _disputed(best, measured[i, j], frames[i, j], near)
+            disputed = _disputed(best, measured[i, j], frames[i, j], others[1][i, j], near)
             sure &= danger <= bounds[5 if disputed else 4]
             rho[i, j], sigma[i, j] = best, nothing
             if sure:
