@@ -633,6 +633,16 @@ def test_baselines_with_and_without_metres_do_not_mix():
     assert drop.cause == 'mixed_scale'
 
 
+@pytest.mark.parametrize('matcher', [m for m in MATCHERS if m != 'joint'])
+def test_without_a_network_that_chooses_no_more_than_half_the_range_may_be_unsure(matcher):
+    sky = World(blank_above=True)
+    current, reference = seen(sky), before('forward', world=sky)
+    one, other = (measured(current, (reference, exact(reference, current)),
+                           stereo__matcher=matcher, range__max_relative_sigma=s).range
+                  for s in (0.5, 10.0))
+    np.testing.assert_array_equal(one, other)
+
+
 def test_a_poor_pose_widens_sigma():
     current, reference = seen(), before('right')
     pose = exact(reference, current)

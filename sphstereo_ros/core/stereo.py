@@ -1,6 +1,7 @@
 """Stage 4, spherical stereo: an aligned window becomes a range image."""
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -32,6 +33,9 @@ from .rotations import mount
 from .walls import walls_seen
 from .warp import aligned_pair
 
+# Sigma over range, at most, of what no network chose by what is round about and remembered.
+_UNJUDGED = 0.5
+
 
 class SphericalStereo:
     """Range of the current frame from all references of a window, and from the windows before.
@@ -54,6 +58,10 @@ class SphericalStereo:
         if config.pairing.mode == 'binocular' and self._joint:
             self._pair = PairMatcher(config.stereo.matcher, self._match,
                                      config.baseline.relative_sigma)
+        self._limits = config.range
+        if config.stereo.matcher != 'joint' or self._pair is not None:
+            self._limits = replace(config.range, max_relative_sigma=min(
+                config.range.max_relative_sigma, _UNJUDGED))
         self._rig = Rig(config.pairing.mode == 'binocular')
         self._down = -mount(config.camera).rotation[2]  # the vehicle's, optical frame
         self._memory = self._new_memory()
@@ -113,7 +121,7 @@ class SphericalStereo:
             estimate = fuse([self._measure(window.current, r) for r in window.references],
                             self._judged)
             estimate = self._above_floor(estimate) if self._judged else estimate
-        r, sigma = published_range(estimate, self.config.range, window.is_metric, mask)
+        r, sigma = published_range(estimate, self._limits, window.is_metric, mask)
         if (self._joint is not None or self._judged) and window.is_metric:
             hidden = far_islands(r)
             r[hidden] = sigma[hidden] = np.nan
