@@ -43,6 +43,7 @@ from sphstereo_ros.scenes.sequence import TruthFrame, load_sequence, render_sequ
 
 from .accuracy import as_frame
 from .reliability import MOST, PERCENTILES, disturbed
+from .scoring import FREE
 from .surroundings import save_scene
 from .unet import Design, Parameters, known_truth, percentile_loss, render_or_fit
 
@@ -84,9 +85,9 @@ _SURFACE_FOUND = 3  # of `Patch.found`, the floor, and the wall after it
 
 _NEVER, _UNKNOWN = -1e4, 2.3  # a logit; logarithm of sigma over inverse range
 _OFF, _RARELY = 0.1, -2.0  # share of the inverse range by which it is off, and a logit to begin
-# Times as far as the truth, near by, that is dangerous, how many times that counts, and by how
-# much the logarithm of how far is near by varies.
-_FREE, _DANGER, _NEAR_BY = 1.5, 10.0, 0.7
+# How many times it counts that what is near by is told FREE times too far, and by how much the
+# logarithm of how far is near by varies.
+_DANGER, _NEAR_BY = 10.0, 0.7
 _SKY = 0.05  # px of parallax of the longest baseline: with less nothing is there
 
 _OF_ERROR, _CHOSEN = 2, 8
@@ -215,7 +216,7 @@ def loss(out: Any, x: Any, found: Any, true: Any, weight: Any) -> Any:
     likeliest = torch.exp(level + each.gather(1, choices.argmax(1, keepdim=True))) - 1
     pixels = torch.exp(level + true) - 1
     off = (pixels - likeliest) / likeliest.clamp(min=1)
-    danger = (pixels > torch.exp(x[:, -1:, :1, :1])) & (pixels > _FREE * likeliest)
+    danger = (pixels > torch.exp(x[:, -1:, :1, :1])) & (pixels > FREE * likeliest)
     doubted = functional.binary_cross_entropy_with_logits(
         doubt, torch.cat([off.abs() > _OFF, pixels < _SKY, danger], 1).float(),
         torch.cat([torch.ones_like(doubt[:, :2]), 1 + (_DANGER - 1) * danger.float()], 1),
