@@ -44,7 +44,7 @@ _LOGARITHMS = (*range(8), *range(16, 20), *range(28, 36), *range(44, 52), *range
                *range(88, 92), *range(96, 100), *range(104, 108), *range(116, 120), 125, 126)
 _DIFFERENCES = (*range(28, 32), *range(44, 48), *range(68, 72), *range(88, 92), *range(96, 100),
                 *range(104, 112), *range(116, 124))
-_TAIL = 0.75  # logarithm of how many standard deviations the 95th percentile may be away
+_TAIL = 0.95  # logarithm of how many standard deviations the 95th percentile may be away
 # Probabilities of being off by over a tenth with which it is told, told over _FAR times as far
 # away as what is near by, and told to be free.
 _OFF, _OFF_FAR, _OFF_FREE = 0.85, 0.75, 0.1

@@ -30,6 +30,7 @@ from .pair_matching import PairMatcher, with_cones
 from .range_memory import RangeMemory
 from .rig import Rig
 from .rotations import mount
+from .smoothing import smoothed
 from .walls import walls_seen
 from .warp import aligned_pair
 
@@ -147,7 +148,10 @@ class SphericalStereo:
             moving[mask != 0] = 0
         self._memory.forget(wrong)
         fused.sigma[wrong] = NOTHING
-        return InverseRange(fused.rho, fused.sigma, joint.signed), moving
+        rho = fused.rho
+        if measured.wider is not None:
+            rho = smoothed(rho, fused.sigma, measured.pose, window.current.image)
+        return InverseRange(rho, fused.sigma, joint.signed), moving
 
     def _measure(self, current: Frame, reference: Reference) -> InverseRange:
         height = current.image.shape[0]
