@@ -238,8 +238,9 @@ class RangeConfig:
     maximum: float = _p('range.max', 120.0, 'confidently farther is +Inf', unit='m', low=0.1,
                         high=10000.0)
     max_relative_sigma: float = _p('range.max_relative_sigma', 0.7, 'sigma over range above '
-                                   'which the range is unknown; of two cameras, and of other '
-                                   'matchers than joint, at most 0.5', low=0.001, high=10.0)
+                                   'which the range is unknown; of two cameras, other matchers '
+                                   'than joint, and a first window, at most 0.5', low=0.001,
+                                   high=10.0)
 
 
 @dataclass(frozen=True)

@@ -46,11 +46,15 @@ _UNSURE = 0.3  # of the range: with a larger sigma nothing is told to be near by
 
 @dataclass(frozen=True)
 class Remembered:
-    """ρ (1/m), its σ (NOTHING where unknown), and evidence: float32 (H, 2H)."""
+    """ρ (1/m), its σ (NOTHING where unknown), and evidence: float32 (H, 2H).
+
+    chosen : whether a network chose ρ and σ, by their looks
+    """
 
     rho: Map
     sigma: Map
     evidence: Map
+    chosen: bool = False
 
 
 @fast_kernel
@@ -222,7 +226,8 @@ class RangeMemory:
                                 *self._surfaces(moved, pixel),
                                 beside(likely, moved.sigma, view, pixel), new.pose, new.wider)
             return Remembered(*self._judged(view, opinions, references[0].pose.direction,
-                                            (min(baselines), max(baselines))), moved.evidence)
+                                            (min(baselines), max(baselines))), moved.evidence,
+                              chosen=True)
         enough = (moved.evidence >= min(self._frames, _PUBLISHED)) & (frames >= 0)
         near_by = moved.rho * np.float32(NEAR_BY * min(baselines)) > 1
         enough &= ~near_by | (moved.sigma < np.float32(_UNSURE) * moved.rho)

@@ -59,10 +59,8 @@ class SphericalStereo:
         if config.pairing.mode == 'binocular' and self._joint:
             self._pair = PairMatcher(config.stereo.matcher, self._match,
                                      config.baseline.relative_sigma)
-        self._limits = config.range
-        if config.stereo.matcher != 'joint' or self._pair is not None:
-            self._limits = replace(config.range, max_relative_sigma=min(
-                config.range.max_relative_sigma, _UNJUDGED))
+        self._unjudged_limits = replace(config.range, max_relative_sigma=min(
+            config.range.max_relative_sigma, _UNJUDGED))
         self._rig = Rig(config.pairing.mode == 'binocular')
         self._down = -mount(config.camera).rotation[2]  # the vehicle's, optical frame
         self._memory = self._new_memory()
@@ -107,7 +105,7 @@ class SphericalStereo:
             return Drop('size_changed', 'the frames of a window differ in size')
         if len({r.pose.is_metric for r in window.references}) != 1:
             return Drop('mixed_scale', 'some baselines of a window are metric, others are not')
-        mask, moving = self._mask_of(height), None
+        mask, moving, limits = self._mask_of(height), None, self._unjudged_limits
         camera = self._rig.camera(window)
         first = window.references[0]
         if self._pair is not None and first.is_beside(window.current):
@@ -117,12 +115,13 @@ class SphericalStereo:
                 estimate = with_cones(estimate, motion, first.pose.direction)
             estimate = self._above_floor(estimate)
         elif self._joint is not None:
-            estimate, moving = self._remembered(self._joint, window, mask)
+            estimate, moving, chosen = self._remembered(self._joint, window, mask)
+            limits = self.config.range if chosen else limits
         else:
             estimate = fuse([self._measure(window.current, r) for r in window.references],
                             self._judged)
             estimate = self._above_floor(estimate) if self._judged else estimate
-        r, sigma = published_range(estimate, self._limits, window.is_metric, mask)
+        r, sigma = published_range(estimate, limits, window.is_metric, mask)
         if (self._joint is not None or self._judged) and window.is_metric:
             hidden = far_islands(r)
             r[hidden] = sigma[hidden] = np.nan
@@ -137,21 +136,21 @@ class SphericalStereo:
         return estimate
 
     def _remembered(self, joint: JointMatcher, window: AlignedWindow,
-                    mask: Image8 | None) -> tuple[InverseRange, Image8]:
-        """What is known without what moves, and that."""
+                    mask: Image8 | None) -> tuple[InverseRange, Image8, bool]:
+        """What is known without what moves, that, and whether the former was chosen."""
+        view = window.current.image
         measured = joint.measure(window.current, window.references)
         fused = self._memory.fused(window.current.key, window.references, measured,
-                                   None if mask is None else mask != 0,
-                                   window.current.image)
+                                   None if mask is None else mask != 0, view)
         wrong, moving = moving_parts(fused, measured, self._down, metric=window.is_metric)
         if mask is not None:
             moving[mask != 0] = 0
         self._memory.forget(wrong)
         fused.sigma[wrong] = NOTHING
         rho = fused.rho
-        if measured.wider is not None:
-            rho = smoothed(rho, fused.sigma, measured.pose, window.current.image)
-        return InverseRange(rho, fused.sigma, joint.signed), moving
+        if fused.chosen:
+            rho = smoothed(rho, fused.sigma, measured.pose, view)
+        return InverseRange(rho, fused.sigma, joint.signed), moving, fused.chosen
 
     def _measure(self, current: Frame, reference: Reference) -> InverseRange:
         height = current.image.shape[0]
