@@ -25,8 +25,9 @@ _FRONT = 0.3  # cosine of the angle to what is in front
 _APART = 1.25  # standard deviations of both by which what is on the plane differs at most
 _GREY = 0.0005  # what differs by so many grey levels squared counts half: 1 over them
 _FLAT = 0.02  # px², added to how far what counts spreads: along a line it has no slope across
-_LEAST = 1e-5  # sigma over inverse range without the pose's share
-_ACCURATE = 0.003  # sigma over inverse range with which it stays as it is
+_LEAST = 1e-5  # of sigma over inverse range, without the pose's share, and of the latter
+# Twice: sigma over inverse range with which it stays as it is, and share of sigma that is left.
+_TIMES = ((0.003, 1.0), (0.014, 0.7))
 _MOST = 0.15  # share of the inverse range by which it changes at most
 
 
@@ -114,20 +115,19 @@ def _plane_of(sums: Map) -> tuple[np.float32, np.float32,
 @fast_kernel
 def _smooth_rows(first: int, last: int, rho: Map, sigma: Map, view: Image8,
                  around: NDArray[np.int32], ends: tuple[int, ...], pictures: NDArray[np.float32],
-                 out: Map) -> None:  # pragma: no cover - compiled
+                 accurate: np.float32, out: Map) -> None:  # pragma: no cover - compiled
     sums, zero = np.empty(9, np.float32), np.float32(0)
     for i in range(first, last):
         for j in range(rho.shape[1]):
             here, spread = rho[i, j], sigma[i, j]
             out[i, j] = here
-            if spread >= np.float32(NOTHING) or spread <= np.float32(_ACCURATE) * here:
+            if spread >= np.float32(NOTHING) or spread <= accurate * here:
                 continue
             plane = (zero, zero, zero)
             for end in ends:
                 _sums(rho, sigma, view, i, j, around[:end], pictures[i], plane, sums)
                 plane = _plane_of(sums)
-            most = np.float32(_MOST) * max(here, zero)
-            out[i, j] += min(max(plane[0], -most), most)
+            out[i, j] += plane[0]
 
 
 def smoothed(rho: Map, sigma: Map, pose: Map, view: Image8) -> Map:
@@ -143,11 +143,15 @@ def smoothed(rho: Map, sigma: Map, pose: Map, view: Image8) -> Map:
     view : uint8 (H, 2H), the same frame, grey
 
     """
-    least = np.float32(_LEAST) * np.abs(rho)
+    least = np.float32(_LEAST) * np.maximum(np.abs(rho), np.float32(_LEAST))
     own = np.sqrt(np.maximum(sigma * sigma - pose * pose, least * least))
-    own = np.where(sigma < NOTHING, own, np.float32(NOTHING))
-    out = np.empty_like(rho)
     around, ends = _around()
-    rows_in_parallel(_smooth_rows, len(rho), rho, own, view, around, ends, _pictures(len(rho)),
-                     out)
-    return out
+    most = np.float32(_MOST) * np.maximum(rho, 0)
+    found = rho
+    for accurate, left in _TIMES:
+        spread = np.where(sigma < NOTHING, np.float32(left) * own, np.float32(NOTHING))
+        given, found = found, np.empty_like(rho)
+        rows_in_parallel(_smooth_rows, len(rho), given, spread, view, around, ends,
+                         _pictures(len(rho)), np.float32(accurate), found)
+        found = np.clip(found, rho - most, rho + most)
+    return found
