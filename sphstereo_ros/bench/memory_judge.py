@@ -55,9 +55,11 @@ _JOBS = (('street', 12, None), ('street', 13, None), ('takeoff', 14, None),
          ('takeoff', 26, None),
          *(('street', seed, None) for seed in (401, 403, 404, 406, 407, 409, 410, 412, 413, 416,
                                                431, 433, 434, 441, 442, 444, 450, 451, 453, 454,
-                                               455, 456, 458, 459, 461, 462, 463, 464, 467)),
-         *(('street', seed, 'traffic') for seed in (405, 408, 432, 443, 452, 457, 460, 465)),
-         ('takeoff', 411, None), ('takeoff', 466, None),
+                                               455, 456, 458, 459, 461, 462, 463, 464, 467, 470,
+                                               472, 473, 476, 478, 479, 482, 484, 487)),
+         *(('street', seed, 'traffic') for seed in (405, 408, 432, 443, 452, 457, 460, 465, 471,
+                                                    474, 477, 480, 481, 486, 488)),
+         *(('takeoff', seed, None) for seed in (411, 466, 475, 489)),
          ('street', 417, 'occlusion'), ('street', 421, 'wall'))
 _HEIGHT = 960
 # Frames back of the references, the first frame that is measured, those that are kept, and whether
@@ -85,9 +87,9 @@ _SURFACE_FOUND = 3  # of `Patch.found`, the floor, and the wall after it
 
 _NEVER, _UNKNOWN = -1e4, 2.3  # a logit; logarithm of sigma over inverse range
 _OFF, _RARELY = 0.1, -2.0  # share of the inverse range by which it is off, and a logit to begin
-# How many times it counts that what is near by is told FREE times too far, and by how much the
-# logarithm of how far is near by varies.
-_DANGER, _NEAR_BY = 10.0, 0.7
+# How many times it counts that what is near by is told FREE times too far, and whether it is; and by
+# how much the logarithm of how far is near by varies.
+_DANGER, _HIDES, _NEAR_BY = 10.0, 3.0, 0.7
 _SKY = 0.05  # px of parallax of the longest baseline: with less nothing is there
 
 _OF_ERROR, _CHOSEN = 2, 8
@@ -219,7 +221,8 @@ def loss(out: Any, x: Any, found: Any, true: Any, weight: Any) -> Any:
     danger = (pixels > torch.exp(x[:, -1:, :1, :1])) & (pixels > FREE * likeliest)
     doubted = functional.binary_cross_entropy_with_logits(
         doubt, torch.cat([off.abs() > _OFF, pixels < _SKY, danger], 1).float(),
-        torch.cat([torch.ones_like(doubt[:, :2]), 1 + (_DANGER - 1) * danger.float()], 1),
+        torch.cat([torch.ones_like(doubt[:, :2]),
+                   _HIDES * (1 + (_DANGER - 1) * danger.float())], 1),
         reduction='none').sum(1, keepdim=True)
     return (percentile_loss(told[:, :_OF_ERROR], off.abs(), weight, LEAST, MOST,
                             PERCENTILES[:_OF_ERROR])

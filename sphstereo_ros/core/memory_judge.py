@@ -44,10 +44,12 @@ _LOGARITHMS = (*range(8), *range(16, 20), *range(28, 36), *range(44, 52), *range
                *range(88, 92), *range(96, 100), *range(104, 108), *range(116, 120), 125, 126)
 _DIFFERENCES = (*range(28, 32), *range(44, 48), *range(68, 72), *range(88, 92), *range(96, 100),
                 *range(104, 112), *range(116, 124))
-_TAIL = 0.95  # logarithm of how many standard deviations the 95th percentile may be away
+# Logarithms of how many standard deviations the 95th percentile may be away: near, and _FAR times
+# as far away as what is near by.
+_TAIL, _TAIL_FAR = 0.95, 1.3
 # Probabilities of being off by over a tenth with which it is told, told over _FAR times as far
 # away as what is near by, and told to be free.
-_OFF, _OFF_FAR, _OFF_FREE = 0.85, 0.75, 0.1
+_OFF, _OFF_FAR, _OFF_FREE = 0.85, 0.7, 0.1
 _FAR = 3.0
 _SKY = 0.05  # probability that only sky is there with which nothing is told near by
 # Outputs: where the choices begin, and after them the logits of being off, of sky, and of hiding
@@ -55,7 +57,7 @@ _SKY = 0.05  # probability that only sky is there with which nothing is told nea
 _CHOICES, _AFTER = 2, 10
 # Probabilities of hiding something near (counted ten times) with which it is told; and where it is
 # only the floor, or the newest frame may miss something near, or sees it _BEFORE times nearer.
-_DANGER, _DISPUTED = 0.5, 0.12
+_DANGER, _DISPUTED = 0.4, 0.08
 _BEFORE = 1.3
 _NEAR_M = 10.0  # m: what is nearer is near by, however slowly the camera moves
 
@@ -256,18 +258,19 @@ def _judge_rows(first: int, last: int, told: NDArray[np.float32], measured: Map,
                 others: tuple[Map, ...], beside: NDArray[np.float32], pose: Map, scale: Map,
                 bounds: Map, rho: Map, sigma: Map) -> None:  # pragma: no cover - compiled
     """others : what was passed over, floor, wall; scale : inverse range of a pixel and of what is
-    near by, share of the 95th percentile, inverse range of what is told to be free; bounds :
+    near by, shares of the 95th percentile, inverse range of what is told to be free; bounds :
     logits of _OFF, _OFF_FAR, _OFF_FREE, _SKY, _DANGER and _DISPUTED
     """
     nothing, pixel, near = np.float32(NOTHING), scale[0], scale[1]
     for i in range(first, last):
         for j in range(rho.shape[1]):
             best = _chosen(told, measured, before, fused, others, beside, i, j)
-            own = likely_error(told, 0, i, j, scale[2]) * max(best, pixel)
+            far = best * np.float32(_FAR) <= near
+            own = likely_error(told, 0, i, j, scale[3 if far else 2]) * max(best, pixel)
             spread = np.sqrt(own * own + pose[i, j] * pose[i, j])
             off, sky, danger = told[_AFTER, i, j], told[_AFTER + 1, i, j], told[_AFTER + 2, i, j]
-            sure = off <= bounds[0 if best * np.float32(_FAR) > near else 1]
-            sure &= off <= bounds[2] or not beyond(best, spread, scale[3])
+            sure = off <= bounds[1 if far else 0]
+            sure &= off <= bounds[2] or not beyond(best, spread, scale[4])
             sure &= sky <= bounds[3] or best < near
             disputed = _disputed(best, measured[i, j], frames[i, j], others[1][i, j], near)
             sure &= danger <= bounds[5 if disputed else 4]
@@ -302,7 +305,7 @@ def judged(view: Image8, opinions: Opinions, direction: NDArray[np.float64],
     outputs = told(inputs(view, opinions, direction, baselines), len(view))
     rho, sigma = np.empty((2, *view.shape), np.float32)
     scale = np.array([pixel_of(len(view), baselines[1]), 1 / near_by(baselines[0]),
-                      np.exp(-_TAIL), farthest], np.float32)
+                      np.exp(-_TAIL), np.exp(-_TAIL_FAR), farthest], np.float32)
     rows_in_parallel(_judge_rows, len(rho), outputs, opinions.measured[0],
                      opinions.frames, opinions.before, opinions.fused,
                      (opinions.wider[3], opinions.floor, opinions.wall[0]), opinions.beside,
