@@ -87,8 +87,8 @@ _SURFACE_FOUND = 3  # of `Patch.found`, the floor, and the wall after it
 
 _NEVER, _UNKNOWN = -1e4, 2.3  # a logit; logarithm of sigma over inverse range
 _OFF, _RARELY = 0.1, -2.0  # share of the inverse range by which it is off, and a logit to begin
-# How many times it counts that what is near by is told FREE times too far, and whether it is; and by
-# how much the logarithm of how far is near by varies.
+# How many times it counts that what is near by is told FREE times too far, and whether it is, and
+# by how much the logarithm of how far is near by varies.
 _DANGER, _HIDES, _NEAR_BY = 10.0, 3.0, 0.7
 _SKY = 0.05  # px of parallax of the longest baseline: with less nothing is there
 
