@@ -152,6 +152,20 @@ def test_what_the_pose_adds_to_sigma_changes_nothing():
     assert np.abs(smoothed(rho, both, view) - found).max() > 0.002
 
 
+@pytest.mark.parametrize('height', [2, 4, 6, 10])
+def test_of_tiny_pictures_only_what_lies_on_them_is_looked_at(height):
+    """A picture amid others that would be mixed in, in memory."""
+    rng = np.random.default_rng(0)
+    shape = (3 * height, 2 * height)
+    rho, sigma = np.full(shape, 0.1, np.float32), np.full(shape, 0.02, np.float32)
+    inside = np.s_[height:2 * height]
+    rho[inside] += rng.normal(0, 0.01, (height, 2 * height)).astype(np.float32)
+    view = rng.integers(0, 255, shape).astype(np.uint8)
+    one = smoothed(rho[inside], sigma[inside], view[inside])
+    rho[:height] = rho[2 * height:] = 0.11
+    np.testing.assert_array_equal(smoothed(rho[inside], sigma[inside], view[inside]), one)
+
+
 def test_it_goes_on_over_the_seam():
     true = plane(0.02, 0.01, -0.05)  # behind, where the image ends and begins
     rho, sigma = noisy(true)

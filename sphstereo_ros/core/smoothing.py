@@ -58,7 +58,7 @@ def _pictures(height: int) -> NDArray[np.float32]:
     ahead = np.sin(other) * np.sin(latitude) + np.cos(other) * np.cos(latitude) * np.cos(right)
     below = np.cos(other) * np.sin(latitude) * np.cos(right) - np.sin(other) * np.cos(latitude)
     beside = np.cos(other) * np.sin(right)
-    front = (ahead > _FRONT) & (np.abs(other) < np.pi / 2)
+    front = (ahead > _FRONT) & (np.abs(other) < np.pi / 2) & (np.abs(right) < np.pi)
     whole = np.stack([below / pixel, beside / pixel, np.ones_like(ahead)], -1)
     whole /= np.where(front, ahead, np.inf)[..., None]
     return whole.astype(np.float32)
