@@ -13,6 +13,7 @@ from sphstereo_ros.core import smoothing, stereo
 from sphstereo_ros.core.config import resolve
 from sphstereo_ros.core.frames import AlignedWindow, Frame, FrameKey, RangeImage, Reference
 from sphstereo_ros.core.inverse_range import NOTHING
+from sphstereo_ros.core.range_memory import RangeMemory, Remembered
 from sphstereo_ros.core.stereo import SphericalStereo
 
 HEIGHT = 96
@@ -222,3 +223,13 @@ def test_what_is_told_is_smooth_and_what_is_remembered_is_not(monkeypatch):
                         lambda *given: given_to.append(given[0].copy()) or smooth_it(*given))
     told_of_room()
     np.testing.assert_array_equal(given_to[-1], kept[-1])
+
+
+def test_nothing_is_told_to_be_free_because_it_was_smoothed(monkeypatch):
+    """Within range.max, or not surely beyond it."""
+    for near in (1.01, 0.95):
+        rho = np.full((160, 320), near / 120, np.float32)
+        monkeypatch.setattr(RangeMemory, 'fused', lambda *_, rho=rho: Remembered(
+            rho.copy(), 0.03 * rho, np.full_like(rho, 6), chosen=True))
+        monkeypatch.setattr(stereo, 'smoothed', lambda rho, *_: 0.85 * rho)
+        assert not np.isposinf(told_of_room()[0].range).any()

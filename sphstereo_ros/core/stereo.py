@@ -149,7 +149,10 @@ class SphericalStereo:
         fused.sigma[wrong] = NOTHING
         rho = fused.rho
         if fused.chosen:
-            rho = smoothed(rho, fused.sigma, measured.pose, view)
+            # What was not surely beyond range.max is not made so: it would be told to be free.
+            farthest = np.float32(1 / self.config.range.maximum if window.is_metric else 0)
+            smooth = smoothed(rho, fused.sigma, measured.pose, view)
+            rho = np.where(rho > farthest, np.maximum(smooth, farthest), rho)
         return InverseRange(rho, fused.sigma, joint.signed), moving, fused.chosen
 
     def _measure(self, current: Frame, reference: Reference) -> InverseRange:
